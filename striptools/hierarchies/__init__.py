@@ -1,1 +1,1 @@
-
+"""Hierarchies over strips and triangles: built, expanded, collapsed and checked."""

@@ -1,1 +1,1 @@
-
+"""The ReduceM scene and its file: layout, writer, reader, validator."""
