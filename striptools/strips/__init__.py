@@ -1,1 +1,1 @@
-
+"""Strips: the Strip-RT ordering, and the topology of generalised and classic strips."""
