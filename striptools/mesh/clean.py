@@ -1,0 +1,249 @@
+"""Make a loaded mesh fit for the stages after it: float32, welded, every face of positive area, every loss counted.
+
+The order of the work, which decides what a face is counted under:
+
+1. Positions are rounded to float32 (to nearest); the largest rounding is reported. A value beyond float32's range
+   becomes infinite.
+2. Vertices are welded. By default those whose three words are equal BIT FOR BIT: so -0.0 and +0.0 stay apart,
+   because positions have to come back bit-exact, and a seam of mixed zeros stays a seam. With a tolerance each
+   vertex, by ascending index, moves to the nearest vertex before it that was not itself moved and lies within the
+   tolerance. So welding is not transitive (a chain of close vertices does not collapse into one), no vertex moves
+   farther than the tolerance, and the first vertex of a cluster keeps its position; -0.0 and +0.0 are then one.
+3. Faces are dropped, each counted under the first reason that holds: `non_finite`, a corner is NaN or infinite;
+   `repeated_vertex`, two corners are one vertex; `zero_area`, the float32 corners lie on one line exactly;
+   `duplicate_faces_dropped`, only where asked, an earlier face has the same vertices in the same winding.
+4. Vertices that no kept face uses are dropped. What is left keeps its order, faces and vertices alike, and each
+   face its first corner.
+
+Zero area is decided exactly: float64 with an error bound first (kernels/degenerate.py); then, for the doubtful
+faces, float64 once more where every difference and product is exact in it; then integers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from striptools.errors import UsageError
+from striptools.mesh.mesh import Mesh
+from striptools.types import FaceIds, Faces, Positions, SourcePositions
+
+CHUNK = 1 << 16
+"""Rows handled at a time where temporary arrays would otherwise be as large as the mesh."""
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """What cleaning may change.
+
+    Args:
+        weld: The farthest a vertex may move to be welded to another, in the model's unit; 0 welds only vertices
+            that are equal bit for bit.
+        drop_duplicates: Whether a face with the same vertices in the same winding as an earlier one is dropped.
+
+    Raises:
+        UsageError: Where `weld` is negative or not finite.
+    """
+
+    weld: float = 0.0
+    drop_duplicates: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.weld) and self.weld >= 0):
+            raise UsageError(f"a weld distance of {self.weld}", remedy="a finite distance of 0 or more is wanted")
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """A mesh that the later stages can rely on, and the account of how it was made.
+
+    Args:
+        mesh: float32 positions, all finite, each used; no face with a repeated vertex or zero area.
+        source_face: `(n,)` int32, ascending: the face of the loaded mesh that each face is. Its corners are the
+            source's in the source's order.
+        counts: `faces_in == faces_out + non_finite + repeated_vertex + zero_area + duplicate_faces_dropped` and
+            `vertices_in == vertices_out + vertices_welded + vertices_unreferenced`; `duplicate_faces_kept` are
+            the faces among `faces_out` that repeat an earlier one in vertices and winding.
+        largest_rounding: The largest change of a coordinate by rounding to float32, in the model's unit; values
+            that overflow are counted as non-finite instead.
+        weld_error: The farthest a vertex was moved by welding, in the model's unit: at most `CleanOptions.weld`.
+    """
+
+    mesh: Mesh
+    source_face: FaceIds
+    counts: dict[str, int]
+    largest_rounding: float
+    weld_error: float
+
+
+DEFAULT_OPTIONS = CleanOptions()
+
+
+def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS) -> Cleaned:
+    """Round, weld and drop as the module's head says; the mesh may come out empty, and its counts say why.
+
+    Raises:
+        UsageError: Where `options` are out of range.
+    """
+    from striptools.kernels.degenerate import USABLE
+
+    positions, largest_rounding = round_positions(mesh.positions)
+    leader, weld_error = weld_vertices(positions, options.weld)
+    welded = int(np.count_nonzero(leader != np.arange(len(leader), dtype=np.int32)))
+    faces = leader[mesh.faces] if welded else mesh.faces
+    verdict = judge_faces(positions, faces)
+    keep = verdict == USABLE
+    counts = {"faces_in": len(faces), **_count_reasons(verdict)}
+    repeats = _drop_repeats(faces, keep, really=options.drop_duplicates)
+    source_face = np.flatnonzero(keep).astype(np.int32)
+    kept_faces = faces[source_face]
+    del faces, verdict, keep
+    used, kept_faces = _renumber(kept_faces, len(positions))
+    vertices_out = int(np.count_nonzero(used))
+    counts |= {
+        "duplicate_faces_dropped": repeats if options.drop_duplicates else 0,
+        "duplicate_faces_kept": 0 if options.drop_duplicates else repeats,
+        "faces_out": len(kept_faces),
+        "vertices_in": len(positions),
+        "vertices_out": vertices_out,
+        "vertices_welded": welded,
+        "vertices_unreferenced": len(positions) - welded - vertices_out,
+    }
+    cleaned = Mesh(positions if used.all() else positions[used], kept_faces, mesh.notes)
+    return Cleaned(cleaned, source_face, counts, largest_rounding, weld_error)
+
+
+def round_positions(positions: SourcePositions) -> tuple[Positions, float]:
+    """The positions in float32, rounded to nearest, and the largest change of a component that stays finite."""
+    if positions.dtype == np.float32:
+        return positions, 0.0
+    largest = 0.0
+    rounded = np.zeros(positions.shape, np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for begin in range(0, len(positions), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            rounded[part] = positions[part]
+            change = np.abs(rounded[part] - positions[part])
+            largest = max(largest, float(np.max(change, initial=0.0, where=np.isfinite(rounded[part]))))
+    return rounded, largest
+
+
+def weld_vertices(positions: Positions, distance: float = 0.0) -> tuple[FaceIds, float]:
+    """The vertex that stands for each vertex, `(v,)` int32, and the farthest that one moves by it.
+
+    Args:
+        positions: `(v, 3)` float32.
+        distance: 0 for bit-equal vertices only, else the tolerance, as in `CleanOptions.weld`.
+    """
+    from striptools.kernels.welding import first_equal_rows, nearest_leaders
+
+    if distance == 0.0:
+        return first_equal_rows(positions.view(np.uint32)), 0.0
+    leader, farthest = nearest_leaders(positions, distance)
+    return leader, float(farthest)
+
+
+def judge_faces(positions: Positions, faces: Faces) -> np.ndarray:
+    """The verdict on each face, `(n,)` uint8 by the constants of `striptools.kernels.degenerate`.
+
+    A face left `DOUBTFUL` is proved to have zero area.
+    """
+    from striptools.kernels.degenerate import DOUBTFUL, USABLE, classify_faces
+
+    verdict = np.zeros(len(faces), np.uint8)
+    classify_faces(positions, faces, verdict)
+    doubtful = np.flatnonzero(verdict == DOUBTFUL)
+    for begin in range(0, len(doubtful), CHUNK):
+        part = doubtful[begin : begin + CHUNK]
+        verdict[part[~has_zero_area(positions[faces[part]])]] = USABLE
+    return verdict
+
+
+def has_zero_area(corners: np.ndarray) -> np.ndarray:
+    """Whether the three points of each row lie on one line exactly, `(n,)` bool.
+
+    Args:
+        corners: `(n, 3, 3)` float32, finite: corner by axis.
+    """
+    edges, exact = _exact_edges(corners)
+    one, two = edges[:, 0], edges[:, 1]
+    i, j = [1, 2, 0], [2, 0, 1]
+    flat = (one[:, i] * two[:, j] == one[:, j] * two[:, i]).all(axis=1)
+    for row in np.flatnonzero(~exact):
+        flat[row] = _on_one_line(_as_integers(corners[row]))
+    return flat
+
+
+def _exact_edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges from the first corner, `(n, 2, 3)` float64, and for which rows their products are exact too.
+
+    A product of two numbers that fit float32 is exact in float64. An edge fits float32 where rounding it changes
+    nothing and no bit was lost by the subtraction, which its two-sum remainder tells (Knuth, TAOCP 2, 4.2.2).
+    """
+    start = corners[:, :1].astype(np.float64)
+    end = corners[:, 1:].astype(np.float64)
+    edges = end - start
+    taken = edges - end
+    remainder = (end - (edges - taken)) - (start + taken)
+    with np.errstate(over="ignore"):
+        fits = (edges.astype(np.float32) == edges) & (remainder == 0)
+    return edges, fits.all(axis=(1, 2))
+
+
+def _as_integers(corners: np.ndarray) -> list[list[int]]:
+    """The float32 corners as integers in units of 2^-149, read from their bits."""
+    bits = corners.view(np.uint32).astype(object)
+    return [[_units(int(word)) for word in row] for row in bits]
+
+
+def _units(word: int) -> int:
+    exponent = word >> 23 & 0xFF
+    fraction = word & 0x7FFFFF
+    size = fraction if exponent == 0 else (fraction | 0x800000) << (exponent - 1)
+    return -size if word >> 31 else size
+
+
+def _on_one_line(corners: list[list[int]]) -> bool:
+    start, *ends = corners
+    (ax, ay, az), (bx, by, bz) = ([e - s for e, s in zip(end, start, strict=True)] for end in ends)
+    return ay * bz == az * by and az * bx == ax * bz and ax * by == ay * bx
+
+
+def _count_reasons(verdict: np.ndarray) -> dict[str, int]:
+    from striptools.kernels.degenerate import DOUBTFUL, NON_FINITE, REPEATED_VERTEX
+
+    codes = {"non_finite": NON_FINITE, "repeated_vertex": REPEATED_VERTEX, "zero_area": DOUBTFUL}
+    return {reason: int(np.count_nonzero(verdict == code)) for reason, code in codes.items()}
+
+
+def _drop_repeats(faces: Faces, keep: np.ndarray, *, really: bool) -> int:
+    """Count the kept faces that repeat an earlier kept one up to rotation; take them out of `keep` if `really`."""
+    from striptools.kernels.welding import first_equal_rows
+
+    kept = np.flatnonzero(keep)
+    turned = _least_vertex_first(faces[kept])
+    repeated = first_equal_rows(turned.view(np.uint32)) != np.arange(len(kept), dtype=np.int32)
+    if really:
+        keep[kept[repeated]] = False
+    return int(np.count_nonzero(repeated))
+
+
+def _least_vertex_first(faces: Faces) -> Faces:
+    """Each row turned so that its least vertex comes first; `faces` is overwritten."""
+    for corner in (1, 2):
+        turn = (faces[:, corner] < faces[:, 0]) & (faces[:, corner] < faces[:, 3 - corner])
+        faces[turn] = np.roll(faces[turn], -corner, axis=1)
+    return faces
+
+
+def _renumber(faces: Faces, vertex_count: int) -> tuple[np.ndarray, Faces]:
+    """Which vertices `faces` use, and `faces` in the numbering of those alone."""
+    used = np.zeros(vertex_count, bool)
+    used[faces.reshape(-1)] = True
+    if used.all():
+        return used, faces
+    place = np.cumsum(used, dtype=np.int32)
+    place -= 1
+    return used, place[faces]

@@ -1,0 +1,39 @@
+"""Settings and fixtures that all tests share."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+ROOT = Path(__file__).resolve().parent.parent
+SLOW_ON_PURPOSE = (HealthCheck.too_slow, HealthCheck.data_too_large)
+
+# Kernels compile inside the first example, so no example has a deadline.
+settings.register_profile("default", max_examples=40, deadline=None, suppress_health_check=SLOW_ON_PURPOSE)
+settings.register_profile("quick", max_examples=8, deadline=None, suppress_health_check=SLOW_ON_PURPOSE)
+settings.register_profile("thorough", max_examples=1000, deadline=None, suppress_health_check=SLOW_ON_PURPOSE)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def meshes_folder() -> Path | None:
+    """The folder of real models: named by STRIPTOOLS_MESHES, else shared/meshes beside the repository."""
+    folder = Path(os.environ.get("STRIPTOOLS_MESHES", ROOT.parent / "shared" / "meshes"))
+    return folder if folder.is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def real_mesh() -> Callable[[str], Path]:
+    """`real_mesh("bunny.ply")` is the path of a real model ("bunny" will do); the test is skipped without it."""
+
+    def find(name: str) -> Path:
+        folder = meshes_folder()
+        if folder is None:
+            pytest.skip("the folder of real models is not here (set STRIPTOOLS_MESHES)")
+        path = folder / (name if "." in name else f"{name}.ply")
+        if not path.exists():
+            pytest.skip(f"the real model {name} is not in the folder of models")
+        return path
+
+    return find
