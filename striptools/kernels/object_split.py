@@ -26,6 +26,9 @@ Tree = namedtuple("Tree", "leaf_node parent size")
 """The tree as it grows: arrays of (n,), (2n-1,) and (2n-1,) int32."""
 
 
+EMPTY_BOX = (np.float32(np.inf),) * 3 + (np.float32(-np.inf),) * 3
+
+
 @njit(cache=True, nogil=True)
 def centre(boxes, position, axis):
     """Twice the centre of a box along an axis."""
@@ -33,68 +36,75 @@ def centre(boxes, position, axis):
 
 
 @njit(cache=True, nogil=True)
-def grow(target, row, source, position):
-    """Make box `row` of target hold box `position` of source too."""
-    for axis in range(3):
-        if source[position, axis] < target[row, axis]:
-            target[row, axis] = source[position, axis]
-        if source[position, 3 + axis] > target[row, 3 + axis]:
-            target[row, 3 + axis] = source[position, 3 + axis]
+def join(box, boxes, row):
+    """The box (a tuple of six, kept in registers) around a box and a row of boxes."""
+    return (
+        min(box[0], boxes[row, 0]),
+        min(box[1], boxes[row, 1]),
+        min(box[2], boxes[row, 2]),
+        max(box[3], boxes[row, 3]),
+        max(box[4], boxes[row, 4]),
+        max(box[5], boxes[row, 5]),
+    )
 
 
 @njit(cache=True, nogil=True)
-def empty_box(target, row):
-    """Make box `row` hold nothing."""
-    for axis in range(3):
-        target[row, axis] = np.inf
-        target[row, 3 + axis] = -np.inf
-
-
-@njit(cache=True, nogil=True)
-def row_area(boxes, row):
+def area(box):
     """Half area of a box that is not empty."""
-    return half_area(boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3], boxes[row, 4], boxes[row, 5])
+    return half_area(box[0], box[1], box[2], box[3], box[4], box[5])
+
+
+@njit(cache=True, nogil=True)
+def empty_bins(bin_boxes, bin_weight):
+    """Make every bin hold nothing."""
+    for row in range(bin_weight.shape[0]):
+        bin_weight[row] = 0
+        for axis in range(3):
+            bin_boxes[row, axis] = np.inf
+            bin_boxes[row, 3 + axis] = -np.inf
 
 
 @njit(cache=True, nogil=True)
 def centre_bounds(boxes, begin, end, least, most):
     """Fill least (3,) and most (3,) with the bounds of the centres of a range."""
     for axis in range(3):
-        least[axis] = np.inf
-        most[axis] = -np.inf
-    for position in range(begin, end):
-        for axis in range(3):
+        low = np.inf
+        high = -np.inf
+        for position in range(begin, end):
             value = centre(boxes, position, axis)
-            if value < least[axis]:
-                least[axis] = value
-            if value > most[axis]:
-                most[axis] = value
+            low = min(low, value)
+            high = max(high, value)
+        least[axis] = low
+        most[axis] = high
 
 
 @njit(cache=True, nogil=True)
 def fill_bins(work, begin, end, bins, least, most, bin_boxes, bin_weight):
     """Sort a range into bins on all three axes at once; side[i, axis] is the bin of item i."""
-    # Empty the bins.
-    for row in range(3 * bins):
-        empty_box(bin_boxes, row)
-        bin_weight[row] = 0
-    # Put every item into its bin of each axis that has an extent.
+    empty_bins(bin_boxes, bin_weight)
+    # Scale each axis that has an extent so that its bins are one apart.
+    scale = np.zeros(3, np.float64)
     for axis in range(3):
-        extent = most[axis] - least[axis]
-        if not extent > 0.0:
-            continue
-        scale = bins / extent
-        for position in range(begin, end):
-            slot = int((centre(work.boxes, position, axis) - least[axis]) * scale)
-            if slot > bins - 1:
-                slot = bins - 1
+        if most[axis] > least[axis]:
+            scale[axis] = bins / (most[axis] - least[axis])
+    # Put every item into its bin of each axis.
+    for position in range(begin, end):
+        box = join(EMPTY_BOX, work.boxes, position)
+        for axis in range(3):
+            slot = min(int((centre(work.boxes, position, axis) - least[axis]) * scale[axis]), bins - 1)
             work.side[position, axis] = slot
-            bin_weight[axis * bins + slot] += work.weights[position]
-            grow(bin_boxes, axis * bins + slot, work.boxes, position)
+            row = axis * bins + slot
+            bin_weight[row] += work.weights[position]
+            bin_boxes[row, 0] = min(bin_boxes[row, 0], box[0])
+            bin_boxes[row, 1] = min(bin_boxes[row, 1], box[1])
+            bin_boxes[row, 2] = min(bin_boxes[row, 2], box[2])
+            bin_boxes[row, 3] = max(bin_boxes[row, 3], box[3])
+            bin_boxes[row, 4] = max(bin_boxes[row, 4], box[4])
+            bin_boxes[row, 5] = max(bin_boxes[row, 5], box[5])
 
 
 @njit(cache=True, nogil=True)
-def best_bin(bins, least, most, bin_boxes, bin_weight, right_cost, box):
+def best_bin(bins, least, most, bin_boxes, bin_weight, right_cost):
     """The axis and the last bin on the left of the cheapest split; axis -1 where all centres are equal."""
     best = np.inf
     best_axis = -1
@@ -103,22 +113,22 @@ def best_bin(bins, least, most, bin_boxes, bin_weight, right_cost, box):
         if not most[axis] > least[axis]:
             continue
         # Gather the cost of everything to the right of each boundary; none without items there.
-        empty_box(box, 0)
+        box = EMPTY_BOX
         weight = 0
         for slot in range(bins - 1, 0, -1):
             row = axis * bins + slot
-            grow(box, 0, bin_boxes, row)
+            box = join(box, bin_boxes, row)
             weight += bin_weight[row]
-            right_cost[slot] = row_area(box, 0) * weight if weight > 0 else np.inf
+            right_cost[slot] = area(box) * weight if weight > 0 else np.inf
         # Sweep from the left and keep the first of the cheapest boundaries.
-        empty_box(box, 0)
+        box = EMPTY_BOX
         weight = 0
         for slot in range(bins - 1):
             row = axis * bins + slot
-            grow(box, 0, bin_boxes, row)
+            box = join(box, bin_boxes, row)
             weight += bin_weight[row]
             if weight > 0:
-                cost = row_area(box, 0) * weight + right_cost[slot + 1]
+                cost = area(box) * weight + right_cost[slot + 1]
                 if cost < best:
                     best = cost
                     best_axis = axis
@@ -141,7 +151,7 @@ def sort_by_centre(boxes, begin, count, axis, rank, key):
 
 
 @njit(cache=True, nogil=True)
-def sweep(work, begin, end, least, most, rank, key, right_cost, box):
+def sweep(work, begin, end, least, most, rank, key, right_cost):
     """Find the cheapest split of a short range over all places of all axes; side[i, 0] is 1 on its right.
 
     Returns False where all centres are equal.
@@ -153,20 +163,20 @@ def sweep(work, begin, end, least, most, rank, key, right_cost, box):
             continue
         sort_by_centre(work.boxes, begin, count, axis, rank, key)
         # Gather the cost of the right side of each place.
-        empty_box(box, 0)
+        box = EMPTY_BOX
         weight = 0
         for j in range(count - 1, 0, -1):
-            grow(box, 0, work.boxes, rank[j])
+            box = join(box, work.boxes, rank[j])
             weight += work.weights[rank[j]]
-            right_cost[j] = row_area(box, 0) * weight
+            right_cost[j] = area(box) * weight
         # Sweep from the left and keep the first of the cheapest places.
-        empty_box(box, 0)
+        box = EMPTY_BOX
         weight = 0
         place = 0
         for j in range(count - 1):
-            grow(box, 0, work.boxes, rank[j])
+            box = join(box, work.boxes, rank[j])
             weight += work.weights[rank[j]]
-            cost = row_area(box, 0) * weight + right_cost[j + 1]
+            cost = area(box) * weight + right_cost[j + 1]
             if cost < best:
                 best = cost
                 place = j + 1
@@ -231,7 +241,6 @@ def split_ranges(work, tree, node, begin, end, depth, bins, sweep_below, sah_dep
     """
     bin_boxes = np.empty((3 * bins, 6), np.float32)
     bin_weight = np.empty(3 * bins, np.int64)
-    box = np.empty((1, 6), np.float32)
     right_cost = np.empty(max(bins, sweep_below), np.float64)
     rank = np.empty(sweep_below, np.int64)
     key = np.empty(sweep_below, np.float64)
@@ -268,11 +277,11 @@ def split_ranges(work, tree, node, begin, end, depth, bins, sweep_below, sah_dep
         if count > 2 and depth < sah_depth:
             centre_bounds(work.boxes, begin, end, least, most)
             if count < sweep_below:
-                if sweep(work, begin, end, least, most, rank, key, right_cost, box):
+                if sweep(work, begin, end, least, most, rank, key, right_cost):
                     middle = partition(work, begin, end, 0, 0)
             else:
                 fill_bins(work, begin, end, bins, least, most, bin_boxes, bin_weight)
-                axis, slot = best_bin(bins, least, most, bin_boxes, bin_weight, right_cost, box)
+                axis, slot = best_bin(bins, least, most, bin_boxes, bin_weight, right_cost)
                 if axis >= 0:
                     middle = partition(work, begin, end, axis, slot)
         # Number the children: the left one follows its parent, the right one the left one's subtree.
