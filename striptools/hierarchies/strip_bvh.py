@@ -48,7 +48,7 @@ class StripHierarchy:
 
 
 def build_strip_hierarchy(
-    strip_boxes: Boxes, triangle_counts: Counts, options: PartitionOptions, threads: int | None = 1
+    strip_boxes: Boxes, triangle_counts: Counts, options: PartitionOptions, threads: int = 1
 ) -> tuple[Counts, StripHierarchy]:
     """Build the hierarchy over strips by the surface area heuristic.
 

@@ -1,0 +1,151 @@
+"""The rules that the arrays of a scene keep (SPEC.md, section 4), asked by the writer and the reader."""
+
+import math
+
+import numpy as np
+
+from striptools.errors import LimitError, UsageError
+from striptools.hierarchies import check as hierarchy_check
+from striptools.reducem.issues import unreadable
+from striptools.reducem.layout import SOURCE_FACE_LIMIT, TRIANGLE_LIMIT
+from striptools.reducem.scene import Scene
+from striptools.types import Boxes
+
+__all__ = ["check_limits", "check_scene", "strip_boxes"]
+
+_HIERARCHY_CODES = {
+    hierarchy_check.WRONG_SIZE: "RDM114",
+    hierarchy_check.EMPTY_CHILD: "RDM401",
+    hierarchy_check.NOT_FINITE: "RDM402",
+    hierarchy_check.NOT_HELD: "RDM403",
+}
+
+
+def check_limits(scene: Scene) -> None:
+    """Make sure that a scene is not larger than the format can hold.
+
+    Raises:
+        LimitError: It is.
+    """
+    if scene.triangle_count > TRIANGLE_LIMIT:
+        raise LimitError(
+            f"{scene.triangle_count} triangles are more than {TRIANGLE_LIMIT}",
+            remedy="split it",
+        )
+    if scene.source_face_count > SOURCE_FACE_LIMIT:
+        raise LimitError(
+            f"{scene.source_face_count} source faces are more than {SOURCE_FACE_LIMIT}",
+            remedy="split the mesh",
+        )
+
+
+def check_scene(scene: Scene, where: str = "scene") -> None:
+    """Make sure that a scene keeps every rule of the format.
+
+    Args:
+        scene: The scene in question; its strips are decoded, once.
+        where: What the error names as its place.
+
+    Raises:
+        UsageError: An array has the wrong dtype.
+        UnreadableSceneError: Naming the first rule broken, by its code.
+    """
+    _check_dtypes(scene)
+    _check_counts(scene, where)
+    _check_strips(scene, where)
+    _check_vertices(scene, where)
+    flaw = hierarchy_check.strip_hierarchy_flaw(scene.hierarchy, strip_boxes(scene))
+    if flaw is not None:
+        raise unreadable(_HIERARCHY_CODES[flaw[0]], f"{where}: HIER: node {flaw[1]}")
+    _check_remap(scene, where)
+
+
+def strip_boxes(scene: Scene) -> Boxes:
+    """Box the vertices of each strip.
+
+    Returns:
+        (s, 6) float32.
+    """
+    corners = scene.positions[scene.vertices]
+    first = scene.starts[:-1].astype(np.int64) + 2 * np.arange(scene.strip_count)
+    return np.hstack([np.minimum.reduceat(corners, first), np.maximum.reduceat(corners, first)])
+
+
+def _check_dtypes(scene: Scene) -> None:
+    wanted = [
+        ("positions", scene.positions, np.float32),
+        ("vertices", scene.vertices, np.int32),
+        ("turns", scene.turns, np.bool_),
+        ("starts", scene.starts, np.int32),
+        ("hierarchy.boxes", scene.hierarchy.boxes, np.float32),
+        ("hierarchy.left_count", scene.hierarchy.left_count, np.uint32),
+    ]
+    if scene.remap is not None:
+        wanted += [
+            ("remap.face", scene.remap.face, np.int32),
+            ("remap.rotation", scene.remap.rotation, np.uint8),
+        ]
+    for name, array, dtype in wanted:
+        if array.dtype != dtype:
+            raise UsageError(f"{name} has dtype {array.dtype}, not {np.dtype(dtype)}", where="scene")
+
+
+def _check_counts(scene: Scene, where: str) -> None:
+    triangles, strips, vertices = scene.triangle_count, scene.strip_count, scene.vertex_count
+    corners = triangles + 2 * strips
+    in_range = 1 <= strips <= triangles <= TRIANGLE_LIMIT and 3 <= vertices <= corners
+    if not (in_range and triangles <= scene.source_face_count <= SOURCE_FACE_LIMIT):
+        raise unreadable("RDM201", f"{where}: SCEN")
+    if not (math.isfinite(scene.error_bound) and scene.error_bound >= 0.0):
+        raise unreadable("RDM202", f"{where}: SCEN")
+    if len(scene.vertices) != corners or scene.positions.shape != (vertices, 3):
+        raise unreadable("RDM114", f"{where}: SVTX")
+
+
+def _check_strips(scene: Scene, where: str) -> None:
+    starts = scene.starts
+    rising = (starts[1:] > starts[:-1]).all()
+    if not (rising and starts[0] == 0 and starts[-1] == scene.triangle_count):
+        raise unreadable("RDM302", f"{where}: STRT")
+    turned = np.flatnonzero(scene.turns[starts[:-1]])
+    if len(turned):
+        raise unreadable("RDM303", f"{where}: TURN: strip {turned[0]}")
+
+
+def _check_vertices(scene: Scene, where: str) -> None:
+    vertices = scene.vertices
+    stray = np.flatnonzero(~np.isfinite(scene.positions).all(axis=1))
+    if len(stray):
+        raise unreadable("RDM301", f"{where}: POSN: position {stray[0]}")
+    outside = np.flatnonzero((vertices < 0) | (vertices >= scene.vertex_count))
+    if len(outside):
+        raise unreadable("RDM305", f"{where}: SVTX: entry {outside[0]}")
+    # A vertex that is new is one more than the largest before it.
+    largest = np.maximum.accumulate(vertices)
+    early = np.flatnonzero(vertices[1:] > largest[:-1] + 1)
+    if vertices[0] != 0 or len(early):
+        raise unreadable("RDM306", f"{where}: SVTX: entry {early[0] + 1 if len(early) else 0}")
+    if largest[-1] != scene.vertex_count - 1:
+        raise unreadable("RDM307", f"{where}: POSN: position {largest[-1] + 1}")
+    a, b, c = scene.faces().T
+    repeated = np.flatnonzero((a == b) | (b == c) | (c == a))
+    if len(repeated):
+        raise unreadable("RDM308", f"{where}: SVTX: triangle {repeated[0]}")
+
+
+def _check_remap(scene: Scene, where: str) -> None:
+    if scene.remap is None:
+        return
+    face, rotation = scene.remap.face, scene.remap.rotation
+    if len(face) != scene.triangle_count or len(rotation) != scene.triangle_count:
+        raise unreadable("RDM114", f"{where}: RMAP")
+    wrong = np.flatnonzero(rotation > 2)
+    if len(wrong):
+        raise unreadable("RDM501", f"{where}: RMAP: triangle {wrong[0]}")
+    outside = np.flatnonzero((face < 0) | (face >= scene.source_face_count))
+    if len(outside):
+        raise unreadable("RDM502", f"{where}: RMAP: triangle {outside[0]}")
+    # Sorted, not counted in a table: a table's size would be the file's word, not its length.
+    ordered = np.sort(face)
+    if (ordered[1:] == ordered[:-1]).any():
+        raise unreadable("RDM503", f"{where}: RMAP")
