@@ -1,0 +1,262 @@
+"""Kernels of the collapse of a binary hierarchy to eight-wide nodes, and of the tracer's leaf blocks."""
+
+import numpy as np
+from numba import njit
+
+WIDTH = 8
+"""Children of a wide node and triangles of a leaf block: the float32 lanes of one AVX register."""
+
+EMPTY = np.int32(-(2**31))
+"""The child of an empty lane."""
+
+
+@njit(cache=True, nogil=True)
+def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
+    """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
+
+    Args:
+        boxes: (2n-1, 6) float32, preorder.
+        size: (2n-1,) int32, triangles below each node.
+        leaf_size: The most triangles of a leaf.
+        node_cost: The cost of visiting a wide node.
+        leaf_cost: The cost of testing a leaf, full or not.
+
+    Returns:
+        split: (2n-1, 9) int8; `split[p, j]`, j >= 2, says how many of j children the left subtree gets, 0
+            means that fewer than j are as cheap; `split[p, 8]` is the split of p as a wide node of its own.
+        as_leaf: (2n-1,) bool, p standing alone is cheapest as a leaf.
+        cost: The summed cost of the whole tree, in units of the surface half-area times the costs given.
+    """
+    count = len(size)
+    cost = np.empty((count, WIDTH), np.float32)
+    split = np.zeros((count, WIDTH + 1), np.int8)
+    as_leaf = np.zeros(count, np.bool_)
+    for p in range(count - 1, -1, -1):
+        dx = boxes[p, 3] - boxes[p, 0]
+        dy = boxes[p, 4] - boxes[p, 1]
+        dz = boxes[p, 5] - boxes[p, 2]
+        area = dx * dy + dy * dz + dz * dx
+
+        # Let a single triangle be a leaf however many children are on offer.
+        if size[p] == 1:
+            as_leaf[p] = True
+            for j in range(1, WIDTH):
+                cost[p, j] = area * leaf_cost
+            continue
+
+        # Find the cheapest way to give eight children to the two subtrees.
+        left = p + 1
+        right = p + 2 * size[left]
+        best = np.float32(np.inf)
+        for k in range(1, WIDTH):
+            c = cost[left, k] + cost[right, WIDTH - k]
+            if c < best or k == 1:
+                best = c
+                split[p, WIDTH] = k
+
+        # Choose between a wide node and, where the triangles are few enough, a leaf.
+        inner = best + area * node_cost
+        leaf = area * leaf_cost
+        if size[p] <= leaf_size and leaf <= inner:
+            as_leaf[p] = True
+            cost[p, 1] = leaf
+        else:
+            cost[p, 1] = inner
+
+        # Offer two to seven children, unless fewer are as cheap.
+        for j in range(2, WIDTH):
+            best = cost[p, j - 1]
+            for k in range(1, j):
+                c = cost[left, k] + cost[right, j - k]
+                if c < best:
+                    best = c
+                    split[p, j] = k
+            cost[p, j] = best
+    return split, as_leaf, cost[0, 1]
+
+
+@njit(cache=True, nogil=True)
+def gather_children(p, size, split, nodes, budget, children):
+    """Write the binary nodes that become the children of the wide node at p, in order; return how many."""
+    nodes[0] = p + 2 * size[p + 1]
+    budget[0] = WIDTH - split[p, WIDTH]
+    nodes[1] = p + 1
+    budget[1] = split[p, WIDTH]
+    held = 2
+    found = 0
+    while held > 0:
+        held -= 1
+        c = nodes[held]
+        j = budget[held]
+        while j > 1 and split[c, j] == 0:
+            j -= 1
+        if j == 1 or size[c] == 1:
+            children[found] = c
+            found += 1
+        else:
+            k = split[c, j]
+            nodes[held] = c + 2 * size[c + 1]
+            budget[held] = j - k
+            nodes[held + 1] = c + 1
+            budget[held + 1] = k
+            held += 2
+    return found
+
+
+@njit(cache=True, nogil=True)
+def assign_lanes(boxes, p, children, found, lane_of):
+    """Give each child of p a lane, whose bits say on which side of p's centre it lies; best fits first."""
+    taken = 0
+    for i in range(found):
+        lane_of[i] = -1
+    for _ in range(found):
+        best = -np.inf
+        best_child = -1
+        best_lane = -1
+        for i in range(found):
+            if lane_of[i] >= 0:
+                continue
+            c = children[i]
+            for lane in range(WIDTH):
+                if (taken >> lane) & 1:
+                    continue
+                fit = 0.0
+                for axis in range(3):
+                    side = (
+                        np.float64(boxes[c, axis]) + boxes[c, axis + 3] - boxes[p, axis] - boxes[p, axis + 3]
+                    )
+                    fit += side if (lane >> axis) & 1 else -side
+                if fit > best or best_child < 0:
+                    best = fit
+                    best_child = i
+                    best_lane = lane
+        lane_of[best_child] = best_lane
+        taken |= 1 << best_lane
+
+
+@njit(cache=True, nogil=True)
+def emit_wide(boxes, size, split, as_leaf):
+    """Lay out the wide nodes that `cheapest_forests` chose.
+
+    Returns:
+        wide_boxes: (w, 6, 8) float32, lo xyz and hi xyz by lane, inverted (inf, -inf) in empty lanes.
+        child: (w, 8) int32, a node, -(leaf + 1), or EMPTY; a node comes after its parent.
+        leaf_first, leaf_count: (l,) int32, the run of triangles of each leaf.
+        depth: The most nodes on a way from the root to a leaf.
+    """
+    limit = max(1, len(size) // 2)
+    wide_boxes = np.empty((limit, 6, WIDTH), np.float32)
+    child = np.full((limit, WIDTH), EMPTY, np.int32)
+    source = np.empty(limit, np.int32)
+    level = np.empty(limit, np.int32)
+    start = np.empty(limit, np.int32)
+    leaf_first = np.empty(len(size) // 2 + 1, np.int32)
+    leaf_count = np.empty(len(size) // 2 + 1, np.int32)
+    pending = np.empty(limit + WIDTH, np.int32)
+    nodes = np.empty(4 * WIDTH, np.int64)
+    budget = np.empty(4 * WIDTH, np.int64)
+    children = np.empty(WIDTH, np.int64)
+    lane_of = np.empty(WIDTH, np.int64)
+    source[0] = 0
+    level[0] = 1
+    start[0] = 0
+    pending[0] = 0
+    waiting = 1
+    wide = 1
+    leaves = 0
+    depth = 1
+    while waiting > 0:
+        waiting -= 1
+        w = pending[waiting]
+        p = source[w]
+        depth = max(depth, level[w])
+
+        # Choose the children; a root of one triangle is its own only child.
+        if size[p] == 1:
+            children[0] = p
+            found = 1
+        else:
+            found = gather_children(p, size, split, nodes, budget, children)
+        assign_lanes(boxes, p, children, found, lane_of)
+        wide_boxes[w, :3, :] = np.inf
+        wide_boxes[w, 3:, :] = -np.inf
+
+        # Write each child in its lane: a leaf at once, a node to be filled later.
+        first = start[w]
+        for i in range(found):
+            c = children[i]
+            lane = lane_of[i]
+            for k in range(6):
+                wide_boxes[w, k, lane] = boxes[c, k]
+            if as_leaf[c]:
+                leaf_first[leaves] = first
+                leaf_count[leaves] = size[c]
+                child[w, lane] = -(leaves + 1)
+                leaves += 1
+            else:
+                source[wide] = c
+                start[wide] = first
+                level[wide] = level[w] + 1
+                child[w, lane] = wide
+                wide += 1
+            first += size[c]
+
+        # Go on with the first child: nodes that are visited together lie together.
+        for i in range(found - 1, -1, -1):
+            c = child[w, lane_of[i]]
+            if c >= 0:
+                pending[waiting] = c
+                waiting += 1
+    return (
+        wide_boxes[:wide].copy(),
+        child[:wide].copy(),
+        leaf_first[:leaves].copy(),
+        leaf_count[:leaves].copy(),
+        depth,
+    )
+
+
+@njit(cache=True, nogil=True)
+def comes_before(positions, a, b):
+    """Whether position a is smaller than position b by x, then y, then z."""
+    for axis in range(3):
+        if positions[a, axis] != positions[b, axis]:
+            return positions[a, axis] < positions[b, axis]
+    return False
+
+
+@njit(cache=True, nogil=True)
+def fill_leaf_blocks(
+    positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_ids, place
+):
+    """Write the triangles of each leaf, lane by lane, in the one corner order that all tests use.
+
+    A triangle is turned, its winding kept, until its smallest corner by (x, y, z) comes first: whatever
+    strip, file order or remap it came by, its arithmetic is the same.
+
+    Args:
+        positions: (v, 3) float32.
+        faces: (n, 3) int32 in file order.
+        ids: (n,) int32, the face that a hit on each triangle is reported as.
+        rotations: (n,) uint8, places that the reported face's corners were turned to the left in `faces`.
+        scale: float32 power of two that positions are multiplied by.
+        leaf_first: (l,) int32.
+        leaf_count: (l,) int32.
+        blocks: (>= l, 9, 8) float32, written: corner a xyz, b xyz, c xyz; other lanes untouched.
+        block_ids: (>= l, 8) int32, written.
+        place: (>= max(ids) + 1,) int32, written: `(leaf * 8 + lane) * 4 + turn` of each face, where
+            canonical corner j is the reported face's corner (j + turn) % 3.
+    """
+    for q in range(len(leaf_first)):
+        for lane in range(leaf_count[q]):
+            t = leaf_first[q] + lane
+            turn = 0
+            for j in range(1, 3):
+                if comes_before(positions, faces[t, j], faces[t, turn]):
+                    turn = j
+            for j in range(3):
+                corner = faces[t, (j + turn) % 3]
+                for axis in range(3):
+                    blocks[q, 3 * j + axis, lane] = positions[corner, axis] * scale
+            block_ids[q, lane] = ids[t]
+            place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3

@@ -1,0 +1,35 @@
+"""What a trace gives back: arrays over the rays, in the order the rays were given."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The closest hit of each of r rays.
+
+    Attributes:
+        t: (r,) float32, the distance along the ray in lengths of its direction; inf on a miss.
+        face: (r,) int32, the source's face through the scene's remap, the file's own without one; -1 on a
+            miss.
+        u: (r,) float32, the weight of the second corner of `face`, counted from its first corner in the
+            source (without
+            a remap: in the file). The point is (1-u-v) p0 + u p1 + v p2. 0 on a miss.
+        v: (r,) float32, the weight of the third corner. 0 on a miss.
+        triangle: (r,) int32, the triangle in the file's order; -1 on a miss.
+        steps: (r,) int32, nodes and leaves visited; None unless asked for.
+    """
+
+    t: Float32[np.ndarray, " r"]
+    face: Int32[np.ndarray, " r"]
+    u: Float32[np.ndarray, " r"]
+    v: Float32[np.ndarray, " r"]
+    triangle: Int32[np.ndarray, " r"]
+    steps: Int32[np.ndarray, " r"] | None = None
+
+    @property
+    def hit(self) -> np.ndarray:
+        """(r,) bool: which rays hit something."""
+        return self.face >= 0

@@ -1,0 +1,111 @@
+"""A scene laid out for the walk: wide nodes, leaf blocks, and the way from a face to its place."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Int32
+
+from striptools.hierarchies.in_strip import BinaryTree, expand_hierarchy
+from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
+from striptools.kernels.wide import fill_leaf_blocks
+from striptools.partition.boxes import face_boxes
+from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
+
+if TYPE_CHECKING:
+    from striptools.reducem.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What a tracer keeps of a scene.
+
+    Attributes:
+        arrays: For the device, as NumPy arrays.
+        triangle_of: (f,) int32, the triangle in file order of each face that hits report; -1 for faces not
+            in the scene.
+        depth: The most wide nodes on a way from the root down.
+    """
+
+    arrays: WideScene
+    triangle_of: Int32[np.ndarray, " f"]
+    depth: int
+
+
+def lay_out(scene: "Scene") -> Layout:
+    """Lay a scene out for the walk through its own hierarchy."""
+    faces = scene.faces()
+    tree = expand_hierarchy(scene.hierarchy, scene.starts, face_boxes(scene.positions, faces))
+    return lay_out_tree(scene, tree)
+
+
+def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
+    """Lay a scene out for the walk through any binary hierarchy over its triangles in file order."""
+    faces = scene.faces()
+    ids, rotations = _names(scene, len(faces))
+    wide = collapse(tree)
+    scale = scale_of(scene)
+    leaves = len(wide.leaf_first)
+    blocks = np.full((size_class(leaves), 9, WIDTH), np.nan, np.float32)
+    block_ids = np.full((len(blocks), WIDTH), NO_FACE, np.int32)
+    face_count = int(ids.max()) + 1
+    place = np.zeros(size_class(face_count), np.int32)
+    fill_leaf_blocks(
+        scene.positions,
+        faces,
+        ids,
+        rotations,
+        scale,
+        wide.leaf_first,
+        wide.leaf_count,
+        blocks,
+        block_ids,
+        place,
+    )
+    triangle_of = np.full(face_count, -1, np.int32)
+    triangle_of[ids] = np.arange(len(ids), dtype=np.int32)
+    boxes, child = _nodes(wide, scale)
+    reach = np.float32(np.abs(scene.positions).max() * scale)
+    return Layout(WideScene(boxes, child, blocks, block_ids, place, scale, reach), triangle_of, wide.depth)
+
+
+def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
+    """The face that a hit on each triangle is reported as, and how its corners are turned."""
+    if scene.remap is None:
+        return np.arange(count, dtype=np.int32), np.zeros(count, np.uint8)
+    return scene.remap.face, scene.remap.rotation
+
+
+def _nodes(wide: WideTree, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Wide nodes as the walk reads them: scaled, empty lanes not a number, padded to a size class."""
+    count = len(wide.boxes)
+    boxes = np.full((size_class(count), 6, WIDTH), np.nan, np.float32)
+    np.multiply(wide.boxes, scale, out=boxes[:count])
+    np.copyto(boxes[:count], np.nan, where=(wide.child == EMPTY)[:, None])
+    child = np.full(WIDTH * len(boxes) + 2 * WIDTH, DONE, np.int32)
+    child[: wide.child.size] = wide.child.ravel()
+    return boxes, child
+
+
+def scale_of(scene: "Scene") -> np.float32:
+    """The power of two that brings the largest coordinate to 1 to 2.
+
+    Scaling by it is exact, and the model's unit no longer matters.
+    """
+    largest = float(np.abs(scene.positions).max())
+    if largest < float(np.finfo(np.float32).tiny):
+        return np.float32(1)
+    exponent = int(np.floor(np.log2(largest)))
+    return np.float32(2.0 ** -min(max(exponent, -126), 126))
+
+
+def size_class(count: int) -> int:
+    """The least of 64, 76, 91, 108, 128, ... (four steps to each doubling) that is at least `count`.
+
+    A program is compiled for the sizes of its arrays: scenes of the same class share it.
+    """
+    size = 64
+    while size < count:
+        quarters = round(4 * np.log2(size)) + 1
+        size = int(np.ceil(2 ** (quarters / 4)))
+    return size

@@ -1,0 +1,48 @@
+"""Float32 arithmetic that means the same wherever XLA compiles it.
+
+XLA's CPU backend contracts a product and a sum to one fused multiply-add whenever it can, flushes
+denormals, and has slow minimum and maximum operations. The functions here say what is meant.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+LOWEST = np.float32(np.finfo(np.float32).min)
+SIGN = np.int32(-(2**31))
+
+
+def smaller(a: Array, b: Array) -> Array:
+    """The smaller of two, `b` where they do not compare: one instruction, where jnp.minimum takes four."""
+    return jnp.where(a < b, a, b)
+
+
+def larger(a: Array, b: Array) -> Array:
+    """The larger of two, `b` where they do not compare."""
+    return jnp.where(a > b, a, b)
+
+
+def rounded(product: Array) -> Array:
+    """A product, rounded to float32 before it is used: no fused multiply-add reaches through.
+
+    Not a number, and minus infinity, become the lowest finite value.
+    """
+    return jnp.where(product > LOWEST, product, LOWEST)
+
+
+def with_sign_of(a: Array, sign_bit: Array) -> Array:
+    """Flip the sign of `a` where `sign_bit` (int32, the top bit or zero) is set."""
+    return lax.bitcast_convert_type(lax.bitcast_convert_type(a, jnp.int32) ^ sign_bit, jnp.float32)
+
+
+def power_of_two_below(a: Array) -> tuple[Array, Array]:
+    """1/p and p for the power of two p <= a < 2p of a normal positive float32; both stay normal."""
+    exponent = lax.bitcast_convert_type(a, jnp.int32) >> 23
+    exponent = jnp.where(exponent > 253, 253, jnp.where(exponent < 1, 1, exponent))
+    inverse = lax.bitcast_convert_type((254 - exponent) << 23, jnp.float32)
+    return inverse, lax.bitcast_convert_type(exponent << 23, jnp.float32)
+
+
+def index(a: Array) -> Array:
+    """An index that is known not to be negative: unsigned, so that XLA adds no case for negative ones."""
+    return a.astype(jnp.uint32)

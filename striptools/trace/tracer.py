@@ -1,0 +1,148 @@
+"""The tracer: rays in, closest hits or any hits out."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from striptools.errors import StriptoolsError, UsageError
+from striptools.trace.device import DeviceKind, trace_devices
+from striptools.trace.hit import Hits
+from striptools.trace.launch import device_mesh, replicate, stream
+from striptools.trace.leaves import Layout, lay_out
+from striptools.trace.walk_wide import STUCK, WalkOptions
+
+if TYPE_CHECKING:
+    from striptools.reducem.scene import Scene
+
+RAYS_SIDE_BY_SIDE = 2
+"""Rays that a CPU walks at once; more gain nothing, since their constants no longer fit the registers."""
+
+
+class Tracer:
+    """Traces rays through one scene.
+
+    Rays are given as origins and directions, (r, 3) and convertible to float32; directions need not be of
+    unit length, and t counts in lengths of the direction. A hit has 0 < t < t_max. The closest hit is that
+    of least t, then of least source face. A ray with a component that is not finite, or with a direction of
+    zero, hits nothing.
+
+    The first call for a number of rays not met before compiles a program (seconds); it is kept in the
+    user's cache folder for the next process.
+
+    Args:
+        scene: What to trace.
+        device: "auto" takes a GPU where JAX has one.
+        threads: CPU devices to use, at most those JAX has; None for all.
+
+    Raises:
+        UsageError: There is no such device.
+    """
+
+    def __init__(self, scene: "Scene", *, device: DeviceKind = "auto", threads: int | None = None) -> None:
+        devices = trace_devices(device, threads)
+        self._on_gpu = devices[0].platform != "cpu"
+        self._mesh = device_mesh(devices)
+        self._take(lay_out(scene))
+
+    def _take(self, layout: Layout) -> None:
+        self._layout = layout
+        self._scene = replicate(layout.arrays, self._mesh)
+        self._stack_size = -(-(layout.depth + 2) // 8) * 8
+
+    @property
+    def devices(self) -> list[Any]:
+        """The JAX devices in use."""
+        return list(self._mesh.devices.flat)
+
+    def closest_hit(
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        *,
+        t_max: np.ndarray | float | None = None,
+        steps: bool = False,
+    ) -> Hits:
+        """Find what each ray hits first.
+
+        Args:
+            origins: (r, 3) in the model's unit.
+            directions: (r, 3).
+            t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
+            steps: Count the nodes and leaves that each ray visits (a program of its own, somewhat slower).
+
+        Raises:
+            UsageError: The arrays are not of these shapes, or not numbers.
+            StriptoolsError: A walk did not end, since the scene's hierarchy is damaged.
+        """
+        rays = checked_rays(origins, directions, t_max)
+        count = len(rays[0])
+        t = np.full(count, np.inf, np.float32)
+        face = np.full(count, -1, np.int32)
+        u, v = np.zeros(count, np.float32), np.zeros(count, np.float32)
+        counted = np.zeros(count if steps else 0, np.int32)
+        for part, traced in stream(self._scene, rays, self._mesh, self._options(any_hit=False, steps=steps)):
+            t[part], face[part], u[part], v[part] = traced[:4]
+            if steps:
+                counted[part] = traced[4]
+        _check_ended(face)
+        triangle = np.where(face < 0, np.int32(-1), self._layout.triangle_of[face])
+        return Hits(t, face, u, v, triangle, counted if steps else None)
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
+    ) -> Bool[np.ndarray, " r"]:
+        """Say of each ray whether it hits anything; arguments and errors as for `closest_hit`."""
+        rays = checked_rays(origins, directions, t_max)
+        hit = np.zeros(len(rays[0]), np.bool_)
+        for part, traced in stream(self._scene, rays, self._mesh, self._options(any_hit=True, steps=False)):
+            _check_ended(traced[1])
+            hit[part] = traced[1] >= 0
+        return hit
+
+    def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:
+        side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
+        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, batch=self._on_gpu)
+
+
+def checked_rays(
+    origins: np.ndarray, directions: np.ndarray, t_max: np.ndarray | float | None
+) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"]]:
+    """Rays as float32 arrays of matching shapes.
+
+    Raises:
+        UsageError: They are not.
+    """
+    start = _as_float32(origins, "origins")
+    way = _as_float32(directions, "directions")
+    for name, rays in (("origins", start), ("directions", way)):
+        if rays.ndim != 2 or rays.shape[1] != 3:
+            raise UsageError(f"of shape {rays.shape}", where=name, remedy="give an array of shape (rays, 3)")
+    if len(start) != len(way):
+        raise UsageError(f"{len(start)} origins for {len(way)} directions", remedy="give one of each per ray")
+    reach = _as_float32(np.inf if t_max is None else t_max, "t_max")
+    if reach.shape not in ((), (len(start),)):
+        raise UsageError(f"of shape {reach.shape}", where="t_max", remedy=f"give one number or {len(start)}")
+    return start, way, np.ascontiguousarray(np.broadcast_to(reach, len(start)))
+
+
+def _as_float32(values: Any, name: str) -> Float32[np.ndarray, "..."]:
+    """Round to float32; what is too large for it becomes infinite, so that its ray is a miss."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            given = np.asarray(values)
+            if given.dtype.kind not in "fiub":
+                raise TypeError(f"{given.dtype} is no real number")
+            return np.ascontiguousarray(given, np.float32).reshape(given.shape)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"not an array of numbers: {error}", where=name, remedy="give float32 values"
+        ) from error
+
+
+def _check_ended(face: np.ndarray) -> None:
+    stuck = int((face == STUCK).sum())
+    if stuck:
+        raise StriptoolsError(
+            f"the walk of {stuck} rays did not end", where="scene hierarchy", remedy="convert the model again"
+        )
