@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from striptools.mesh.io import load_mesh, save_mesh
     from striptools.mesh.mesh import Mesh
     from striptools.partition.sah import PartitionOptions
-    from striptools.pipeline import Options, Report, convert, convert_with_report, open  # noqa: A004
+    from striptools.pipeline import Options, Report, convert, convert_with_report, open
     from striptools.reducem.scene import Scene
     from striptools.strips.ordering import OrderingOptions
 

@@ -1,7 +1,7 @@
-"""The data's way in one screen: load, clean, partition, adjacency, order, hierarchy, output, and the scene file.
+"""The data's way in one screen: load, clean, partition, adjacency, order, hierarchy, output, scene.
 
-Source: the four steps of Strip-RT (Lauterbach, Yoon, Tang, Manocha, EGSR 2008, section 4) between a loader that
-hides nothing and a scene that can be traced as it lies.
+Source: the four steps of Strip-RT (Lauterbach, Yoon, Tang, Manocha, EGSR 2008, section 4) between a loader
+that hides nothing and a scene that can be traced as it lies.
 """
 
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ class Options:
         partition: The SAH object split.
         ordering: Strip-RT.
         remap: Keep the source face and first corner of every triangle in the scene.
-        threads: Threads of the stages that can use several; None for every core. The scene does not depend on it.
+        threads: Threads of the stages that can use several; None for every core. The scene is the same.
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)
@@ -152,7 +152,7 @@ def convert_with_report(
     return scene, Report(seconds, peak, counts, cleaned.largest_rounding, cleaned.weld_error, notes)
 
 
-def open(source: str | Path | IO[bytes]) -> Scene:  # noqa: A001
+def open(source: str | Path | IO[bytes]) -> Scene:
     """Read a ReduceM scene file.
 
     Args:

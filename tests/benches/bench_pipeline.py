@@ -17,6 +17,7 @@ from results import Row, append
 import striptools
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh, save_mesh
+from striptools.pipeline import STAGES
 
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
@@ -26,7 +27,7 @@ MESHES = (
 
 def main() -> int:
     """Measure each model, print its row, and say how many failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("meshes", nargs="*", default=MESHES)
     parser.add_argument("--record", action="store_true")
@@ -35,7 +36,8 @@ def main() -> int:
     for name in arguments.meshes:
         rows = measure(name, arguments.folder / f"{name}.ply")
         figures = {row.metric: row.value for row in rows}
-        sys.stdout.write(f"{name}: " + ", ".join(f"{key} {value:.6g}" for key, value in figures.items()) + "\n")
+        line = ", ".join(f"{key} {value:.6g}" for key, value in figures.items())
+        sys.stdout.write(f"{name}: {line}\n")
         sys.stdout.flush()
         failed += bool(figures["disagreements"] or figures["leaks"] or figures["faces lost on the way back"])
         if arguments.record:
@@ -58,7 +60,7 @@ def measure(name: str, path: Path) -> list[Row]:
     triangles = scene.triangle_count
     figures = [
         ("pipeline after warm-up", report.seconds["total"], "s"),
-        *((f"pipeline: {stage}", seconds, "s") for stage, seconds in report.seconds.items() if stage != "total"),
+        *((f"stage {stage}", report.seconds[stage], "s") for stage in STAGES),
         ("peak memory above the imports", report.peak_bytes / triangles, "bytes per triangle"),
         ("vertices per triangle in strips", len(scene.vertices) / triangles, ""),
         ("strips", scene.strip_count, ""),

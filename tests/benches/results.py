@@ -1,4 +1,4 @@
-"""The results file: one row a figure, with machine, versions and, where there is one, the peer of the same run."""
+"""The results file: a row a figure, with machine, versions and the peer of the same run."""
 
 import csv
 import datetime
@@ -65,7 +65,8 @@ def machine() -> str:
     model = platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        lines = [line for line in info.read_text().splitlines() if "model name" in line]
+        names = [line.split(":", 1)[1].strip() for line in lines]
         model = names[0] if names else model
     return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
