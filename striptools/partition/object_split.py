@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from striptools.errors import LimitError, StriptoolsError, UsageError
+from striptools.errors import LimitError, UsageError
 from striptools.kernels import object_split as kernels
 from striptools.partition.sah import PartitionOptions
 from striptools.types import Boxes, Counts
@@ -134,7 +134,7 @@ def check_object_tree(tree: ObjectTree) -> None:
     """Raise unless the tree is whole: each item once, preorder sizes and parents, and the inverse map.
 
     Raises:
-        StriptoolsError: Naming the first broken node or item.
+        UsageError: Naming the first broken node or item.
     """
     count, nodes = len(tree.order), len(tree.size)
     _expect(count >= 1 and nodes == 2 * count - 1, f"{nodes} nodes over {count} items")
@@ -178,4 +178,4 @@ def _split_in_threads(
 
 def _expect(holds: bool, what: str) -> None:
     if not holds:
-        raise StriptoolsError(what, where="object tree", remedy="a bug: please report it")
+        raise UsageError(what, where="object tree")

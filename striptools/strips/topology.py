@@ -1,0 +1,271 @@
+"""Topology of strips: generalised ones with one turn bit a triangle, classic alternating ones for export.
+
+**Generalised strips** (what the scene stores). A strip of k triangles is a row of k + 2 vertices and k turn
+bits. Its first triangle is (a, b, c) = vertices 0, 1, 2. Each further triangle j adds vertex j + 2, w,
+behind the edge by which the strip leaves the triangle (a, b, c) before it:
+
+    turn bit 0: by b -> c, the next triangle is (c, b, w)
+    turn bit 1: by c -> a, the next triangle is (a, c, w)
+
+Both run the shared edge against the triangle before, so that every triangle has the winding of its source
+face. The edge a -> b, by which a triangle was entered, is never left by. The turn bit of a strip's FIRST
+triangle is unused and is 0. An encoder turns the first triangle so that the bit of the SECOND is 0; a
+decoder takes either.
+
+So in triangle j of a strip c is vertex j + 2, and, looking back from j over the bits 1..j, a is the vertex p
++ 1 of the last triangle p with bit 0, b the vertex q + 1 of the last triangle q with bit 1; where there is
+none a is vertex 0 and b vertex 1. One triangle can be read alone from its strip's bits by counting trailing
+ones and zeros.
+
+Source: Lauterbach et al., ReduceM (EGSR 2008), step "Strip output", which prints index lists with repeated
+("swap") vertices. Differences:
+1. A turn bit stands for a swap vertex: n + 2 vertices for n triangles, whatever the turns.
+2. The rotation of each triangle against its source face is kept, so that source corners can be restored.
+3. Where two faces share more than one edge, any crossing that leaves no face by its entry edge is found.
+
+**Classic strips** (classic_strips): triangle k of a strip is indices k, k + 1, k + 2, with the first two
+swapped for odd k. Equal turns in a row cost one repeated vertex each; strips are set apart by a restart
+index.
+
+Cost: O(n), all of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from striptools.errors import UsageError
+from striptools.kernels import strip_topology as kernels
+from striptools.strips.ordering import Sequences
+from striptools.types import Bools, Counts, FaceIds, Faces, Rotations
+
+RESTART = -1
+"""What sets classic strips apart; no vertex index is negative."""
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Generalised strips and where their triangles come from.
+
+    Strip i covers triangles starts[i]:starts[i+1] and vertices starts[i] + 2 i : starts[i+1] + 2 i + 2.
+
+    Attributes:
+        vertices: (c,) int32, c = n + 2 s.
+        turns: (n,) bool, the turn bit of each triangle, False for the first of each strip.
+        starts: (s+1,) int32, in triangles.
+        source_face: (n,) int32, the face each triangle was.
+        rotation: (n,) uint8, places its corners were turned to the left: decoded[j] = source[(j + rotation)
+        % 3].
+    """
+
+    vertices: Counts
+    turns: Bools
+    starts: Counts
+    source_face: FaceIds
+    rotation: Rotations
+
+
+def encode_strips(faces: Faces, sequences: Sequences) -> Strips:
+    """Write sequences of faces as generalised strips.
+
+    Args:
+        faces: (n, 3) int32.
+        sequences: Each face once, neighbours share an edge run in opposite directions.
+
+    Returns:
+        Strips whose decoded triangles are the faces of `sequences.faces`, turned left by `rotation`.
+
+    Raises:
+        UsageError: A face in a sequence cannot be reached from the face before it.
+    """
+    order, starts = sequences.faces, sequences.starts
+    entries = _entries(faces, sequences)
+    vertices = np.zeros(len(order) + 2 * (len(starts) - 1), np.int32)
+    turns = np.zeros(len(order), np.bool_)
+    rotation = np.zeros(len(order), np.uint8)
+    kernels.encode(faces, order, starts, entries, vertices, turns, rotation)
+    return Strips(vertices, turns, starts, order, rotation)
+
+
+def decode_strips(vertices: Counts, turns: Bools, starts: Counts) -> Faces:
+    """The triangles of generalised strips, (n, 3) int32, in file order and with the winding of their sources.
+
+    Args:
+        vertices: (n + 2 s,) int32.
+        turns: (n,) bool; those of first triangles are not looked at.
+        starts: (s+1,) int32, from 0 to n, rising.
+
+    Raises:
+        UsageError: Arrays whose lengths do not belong together.
+    """
+    a, b, c = corner_places(turns, starts)
+    if len(vertices) != len(c) + 2 * (len(starts) - 1):
+        raise UsageError(f"{len(vertices)} vertices for {len(c)} triangles", where="decode_strips")
+    return np.stack([vertices[a], vertices[b], vertices[c]], axis=1)
+
+
+def corner_places(turns: Bools, starts: Counts) -> tuple[Counts, Counts, Counts]:
+    """Where in the strip vertices the three corners of each triangle stand: three arrays (n,) int32.
+
+    Raises:
+        UsageError: starts that do not rise from 0 to the number of turns.
+    """
+    count = len(turns)
+    if len(starts) == 0 or starts[0] != 0 or starts[-1] != count or (np.diff(starts) < 1).any():
+        raise UsageError(f"strip starts do not rise from 0 to {count}", where="starts")
+    last = np.arange(2, count + 2, dtype=np.int32)
+    last += 2 * np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
+    # The vertex before the newest is corner 0 after bit 0 and corner 1 after bit 1; the other one stays what
+    # it was.
+    a = np.where(turns, 0, last - 1)
+    b = np.where(turns, last - 1, 0)
+    a[starts[:-1]] = last[starts[:-1]] - 2
+    b[starts[:-1]] = last[starts[:-1]] - 1
+    return np.maximum.accumulate(a), np.maximum.accumulate(b), last
+
+
+def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: int) -> tuple[int, int, int]:
+    """One triangle alone, read from its strip's own vertices and turn bits.
+
+    Args:
+        vertices: (n + 2 s,) int32.
+        turns: (n,) bool.
+        starts: (s+1,) int32.
+        triangle: Its place in file order.
+    """
+    strip = int(np.searchsorted(starts, triangle, side="right")) - 1
+    begin = int(starts[strip])
+    first = begin + 2 * strip
+    bits = turns[begin + 1 : triangle + 1][::-1]
+    places = []
+    for corner, bit in ((0, False), (1, True)):
+        back = np.flatnonzero(bits == bit)[:1]
+        places.append(first + (triangle - begin - int(back[0]) + 1 if len(back) else corner))
+    last = first + triangle - begin + 2
+    return int(vertices[places[0]]), int(vertices[places[1]]), int(vertices[last])
+
+
+def classic_strips(strips: Strips, restart: int = RESTART) -> Counts:
+    """Classic alternating strips as one index list, the strips set apart by `restart`.
+
+    Every triangle keeps its winding. Two equal turns in a row cost one repeated vertex, which makes a
+    triangle of no area that decode_classic and every renderer drop.
+
+    Args:
+        strips: Generalised strips of faces with three different vertices.
+        restart: The index between strips; no vertex may have it.
+
+    Returns:
+        (k,) int32.
+
+    Raises:
+        UsageError: A vertex has the restart index, or a triangle a repeated vertex.
+    """
+    rows = decode_strips(strips.vertices, strips.turns, strips.starts)
+    if (strips.vertices == restart).any():
+        raise UsageError(f"vertex {restart} is the restart index", where="restart")
+    if _repeats(rows).any():
+        raise UsageError(
+            "a triangle has a repeated vertex", where="classic_strips", remedy="clean the mesh first"
+        )
+    firsts = strips.starts[:-1]
+    lasts = strips.starts[1:] - 1
+    # A first triangle left by c -> a is turned once more, so that every strip starts with a turn of bit 0.
+    leaving = np.append(strips.turns[1:], False)
+    leaving[lasts] = False
+    rows[firsts] = np.where(leaving[firsts, None], np.roll(rows[firsts], -1, axis=1), rows[firsts])
+    leaving[firsts] = False
+    # A swap repeats corner 0 or 1 before the newest vertex wherever a triangle is left by the turn it was
+    # entered by.
+    entered = np.append(False, leaving[:-1])
+    swaps = leaving == entered
+    swaps[firsts] = False
+    swaps[lasts] = False
+    return _written(rows, np.where(leaving, rows[:, 0], rows[:, 1]), swaps, firsts, restart)
+
+
+def decode_classic(indices: Counts, restart: int = RESTART) -> Faces:
+    """The triangles of classic strips, (n, 3) int32, in order; those with a repeated vertex are dropped.
+
+    Args:
+        indices: (k,) int32.
+        restart: The index that sets strips apart.
+    """
+    indices = np.asarray(indices, np.int32)
+    place = np.arange(len(indices))
+    since = place - np.maximum.accumulate(np.where(indices == restart, place, -1)) - 1
+    last = np.flatnonzero(since >= 2)
+    rows = np.stack([indices[last - 2], indices[last - 1], indices[last]], axis=1)
+    odd = since[last] % 2 == 1
+    rows[odd, :2] = rows[odd, 1::-1]
+    return rows[~_repeats(rows)]
+
+
+def check_sequences(sequences: Sequences, faces: Faces, max_length: int | None = None) -> None:
+    """Raise unless each face stands once, and each can be reached from the one before it in its sequence.
+
+    Raises:
+        UsageError: Naming what is broken and where.
+    """
+    order, starts = sequences.faces, sequences.starts
+    _expect(np.array_equal(np.sort(order), np.arange(len(faces))), "sequences", "not each face stands once")
+    _check_starts(starts, len(order), "sequences")
+    longest = int(sequences.lengths.max(initial=0))
+    _expect(max_length is None or longest <= max_length, "sequences", f"one has {longest} faces")
+    place = kernels.choose_entries(faces, order, starts, np.zeros(len(order), np.uint8))
+    _expect(place < 0, "sequences", f"the face at {place} does not continue the one before it")
+
+
+def check_strips(strips: Strips, faces: Faces) -> None:
+    """Raise unless the strips hold every face once, each turned left by its rotation and never reflected.
+
+    Raises:
+        UsageError: Naming what is broken and where.
+    """
+    count, strip_count = len(strips.turns), len(strips.starts) - 1
+    _check_starts(strips.starts, count, "strips")
+    _expect(len(strips.vertices) == count + 2 * strip_count, "strips", f"{len(strips.vertices)} vertices")
+    _expect(not strips.turns[strips.starts[:-1]].any(), "strips", "an unused turn bit is set")
+    source, rotation = strips.source_face, strips.rotation
+    _expect(np.array_equal(np.sort(source), np.arange(len(faces))), "strips", "not each face stands once")
+    _expect(len(rotation) == count and not (rotation > 2).any(), "strips", "a rotation is not 0, 1 or 2")
+    corners = (np.arange(3) + rotation[:, None]) % 3
+    turned = np.take_along_axis(faces[source], corners, axis=1)
+    wrong = (decode_strips(strips.vertices, strips.turns, strips.starts) != turned).any(axis=1)
+    _expect(not wrong.any(), "strips", f"triangle {wrong.argmax()} is not its source face")
+
+
+def _entries(faces: Faces, sequences: Sequences) -> Rotations:
+    entries = np.zeros(len(sequences.faces), np.uint8)
+    place = kernels.choose_entries(faces, sequences.faces, sequences.starts, entries)
+    if place >= 0:
+        raise UsageError(f"the face at {place} does not continue the one before it", where="encode_strips")
+    return entries
+
+
+def _repeats(rows: Faces) -> Bools:
+    return (rows[:, 0] == rows[:, 1]) | (rows[:, 1] == rows[:, 2]) | (rows[:, 2] == rows[:, 0])
+
+
+def _written(rows: Faces, pivots: Counts, swaps: Bools, firsts: Counts, restart: int) -> Counts:
+    """Lay out: before each first triangle a restart and its first two corners, before each swap its pivot."""
+    ahead = swaps.astype(np.int64)
+    ahead[firsts] = 3
+    at = np.cumsum(ahead + 1) - 1
+    out = np.zeros(int(at[-1]) + 1 if len(at) else 0, np.int32)
+    out[at] = rows[:, 2]
+    out[at[swaps] - 1] = pivots[swaps]
+    out[at[firsts] - 1] = rows[firsts, 1]
+    out[at[firsts] - 2] = rows[firsts, 0]
+    out[at[firsts] - 3] = restart
+    return out[1:]
+
+
+def _check_starts(starts: Counts, count: int, where: str) -> None:
+    good = len(starts) >= 1 and starts[0] == 0 and starts[-1] == count and not (np.diff(starts) < 1).any()
+    _expect(bool(good), where, f"starts do not rise from 0 to {count}")
+
+
+def _expect(holds: bool, where: str, what: str) -> None:
+    if not holds:
+        raise UsageError(what, where=where)
