@@ -155,7 +155,9 @@ def _check_cuts(label: np.ndarray, edge: np.ndarray, *, forward: np.ndarray, loo
     members = np.bincount(label, minlength=len(label))
     ahead = np.bincount(label, weights=forward, minlength=len(label)).astype(np.int64)
     matched = np.minimum(ahead, members - ahead)
-    of_edge = np.bincount(edge, weights=matched[label] / members[label], minlength=edges).round().astype(np.int64)
+    of_edge = (
+        np.bincount(edge, weights=matched[label] / members[label], minlength=edges).round().astype(np.int64)
+    )
     ahead_of_edge = np.bincount(edge, weights=forward, minlength=edges).astype(np.int64)
     best = np.minimum(ahead_of_edge, size - ahead_of_edge)
     _require((of_edge == best)[edge] | loop, "windings do not alternate along the rings")

@@ -71,7 +71,9 @@ def refusals_named(output: object) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         raise WriteError(
-            f"could not be written: {reason}", where=str(output), remedy="nothing half-written was left behind"
+            f"could not be written: {reason}",
+            where=str(output),
+            remedy="nothing half-written was left behind",
         ) from error
 
 

@@ -52,7 +52,9 @@ class CleanOptions:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.weld) and self.weld >= 0):
-            raise UsageError(f"a weld distance of {self.weld}", remedy="a finite distance of 0 or more is wanted")
+            raise UsageError(
+                f"a weld distance of {self.weld}", remedy="a finite distance of 0 or more is wanted"
+            )
 
 
 @dataclass(frozen=True, eq=False)

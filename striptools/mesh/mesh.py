@@ -45,7 +45,9 @@ class Mesh:
         if faces.dtype.kind not in "iu":
             raise UsageError(f"faces are {faces.dtype}", remedy="integer indices are wanted")
         if len(faces) > MOST_FACES:
-            raise LimitError(f"{len(faces)} faces", remedy=f"at most {MOST_FACES} are handled; split the model")
+            raise LimitError(
+                f"{len(faces)} faces", remedy=f"at most {MOST_FACES} are handled; split the model"
+            )
         bad = first_face_out_of_range(faces, len(positions))
         if bad is not None:
             raise UsageError(f"face {bad} names a vertex that does not exist", where="faces")
