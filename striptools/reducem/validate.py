@@ -7,7 +7,6 @@ this package only the issue catalogue and the decoding of strips.
 import math
 import struct
 import zlib
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -249,5 +248,5 @@ def _remap(parsed: _Parsed, source_faces: int) -> None:
     faces = words % (1 << 30)
     if (faces >= source_faces).any():
         parsed.found("RDM502", "RMAP")
-    if max(Counter(faces.tolist()).values()) > 1:
+    if len(np.unique(faces)) < len(faces):
         parsed.found("RDM503", "RMAP")
