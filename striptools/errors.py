@@ -1,4 +1,4 @@
-"""Errors that a user can act on: one line that says what, where and the remedy, and the exit code it ends in."""
+"""Errors that a user can act on: one line of what, where and remedy, and the exit code it ends in."""
 
 EXIT_DONE = 0
 EXIT_ISSUES = 1

@@ -4,6 +4,7 @@ Source: the four steps of Strip-RT (Lauterbach, Yoon, Tang, Manocha, EGSR 2008, 
 that hides nothing and a scene that can be traced as it lies.
 """
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -24,6 +25,7 @@ from striptools.reducem.scene import Scene, scene_from_strips
 from striptools.stopwatch import Stopwatch, Watch
 from striptools.strips.ordering import OrderingOptions, order_strips
 from striptools.strips.topology import encode_strips
+from striptools.types import Faces, Positions
 
 STAGES = ("load", "clean", "partition", "adjacency", "order", "hierarchy", "output")
 """The stages of a conversion, in order; a command that writes the scene adds `write`."""
@@ -114,6 +116,7 @@ def convert_with_report(
         LimitError: The mesh is larger than a scene can hold.
     """
     options = options or Options()
+    threads = options.threads or len(os.sched_getaffinity(0))
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
@@ -124,7 +127,7 @@ def convert_with_report(
         del mesh, source
     with clock.stage("partition"):
         boxes = face_boxes(positions, faces)
-        tree = split_objects(boxes, options.partition, threads=options.threads)
+        tree = split_objects(boxes, options.partition, threads=threads)
     with clock.stage("adjacency"):
         adjacency = build_adjacency(faces, len(positions))
     with clock.stage("order"):
@@ -134,7 +137,7 @@ def convert_with_report(
         strip_boxes = range_boxes(boxes[sequences.faces], sequences.starts)
         triangle_counts = np.diff(sequences.starts)
         order, hierarchy = build_strip_hierarchy(
-            strip_boxes, triangle_counts, options.partition, threads=options.threads
+            strip_boxes, triangle_counts, options.partition, threads=threads
         )
         del boxes, strip_boxes
     with clock.stage("output"):
@@ -167,9 +170,12 @@ def open(source: str | Path | IO[bytes]) -> Scene:
     return read_scene(source)
 
 
-def _remaining(cleaned: Cleaned) -> tuple:
+def _remaining(cleaned: Cleaned) -> tuple[Faces, Positions]:
     if cleaned.mesh.triangle_count == 0:
-        dropped = ", ".join(f"{count} {reason}" for reason, count in cleaned.dropped.items() if count)
+        reasons = ("non_finite", "repeated_vertex", "zero_area")
+        dropped = ", ".join(
+            f"{cleaned.counts[r]} {r.replace('_', ' ')}" for r in reasons if cleaned.counts[r]
+        )
         raise UnreadableMeshError(
             f"no face is left after cleaning: {dropped or 'there was none'}",
             remedy="a scene needs a triangle with an area",
