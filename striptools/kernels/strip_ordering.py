@@ -106,7 +106,7 @@ def propose(active, ring, faces, state, parent, size, most, distance_weight, bal
         farthest = 1
         for k in range(count):
             farthest = max(farthest, distance[k])
-        # Keep the best candidate; among equal pairs the first half-edges.
+        # Keep the best candidate; for one partner the least half-edges.
         for k in range(count):
             r = state.owner[enter[k] // 3]
             n1 = np.float64(state.length[s])
@@ -115,7 +115,13 @@ def propose(active, ring, faces, state, parent, size, most, distance_weight, bal
             balance = 4.0 * n1 * n2 / ((n1 + n2) * (n1 + n2))
             score = distance_weight * near + balance_weight * balance
             best = wanted.partner[s]
-            if best < 0 or comes_before(score, s, r, wanted.score[s], s, best):
+            if r == best:
+                better = leave[k] < wanted.leave[s] or (
+                    leave[k] == wanted.leave[s] and enter[k] < wanted.enter[s]
+                )
+            else:
+                better = best < 0 or comes_before(score, s, r, wanted.score[s], s, best)
+            if better:
                 wanted.partner[s] = r
                 wanted.score[s] = score
                 wanted.leave[s] = leave[k]

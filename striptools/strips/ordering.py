@@ -16,8 +16,8 @@ so (1 - d / d_max) / 2 + H / (n1 + n2) by the default weights, each term at most
 d_max is.
 
 Differences and decisions:
-1. Each sequence proposes its best join; of equal scores the smaller pair of sequence names (a sequence is
-   named by the least face it was joined from), then the first half-edges in slot and ring order.
+1. Faces are numbered by their place in the tree, a sequence by the least place in it. Each sequence proposes
+   its best join: highest score, then the smaller pair of sequence numbers, then the least half-edges.
 2. The two sides of a pair may score it differently (each has its own d_max), so "mutual best" may never come:
    proposals are accepted from the best down (score, then the smaller pair, then the smaller proposer), each
    that meets two sequences still free in this round. The best proposal of a round always is, so a round with
@@ -28,8 +28,8 @@ Differences and decisions:
    reflects a triangle; each half-edge carries one link at most, so a triangle is never left through the edge
    it was entered by.
 
-Cost: O(E) a round for E open edges, the sequences roughly halving; about 60 bytes a triangle of working
-memory.
+Cost: O(E) a round for E open edges, the sequences roughly halving; about 110 bytes a triangle of
+working memory.
 """
 
 from dataclasses import dataclass
@@ -38,10 +38,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from striptools.errors import UsageError
-from striptools.kernels import strip_ordering as kernels
 from striptools.types import Counts, FaceIds, Faces
 
 if TYPE_CHECKING:
+    from striptools.kernels.strip_ordering import State
     from striptools.mesh.adjacency import Adjacency
     from striptools.partition.object_split import ObjectTree
 
@@ -119,12 +119,14 @@ def order_strips(
         options: Cap and weights; the defaults of OrderingOptions when left out.
 
     Returns:
-        Sequences of at most max_length faces, each written from its end of smaller face index, in the order
-        of those ends; `check_sequences` holds for them.
+        Sequences of at most max_length faces, each written from its end that comes first in the tree, in the
+        order of those ends; `check_sequences` holds for them.
 
     Raises:
         UsageError: Arrays that do not belong together.
     """
+    from striptools.kernels import strip_ordering as kernels
+
     options = options or OrderingOptions()
     count = len(faces)
     if len(adjacency.ring) != 3 * count or len(tree.leaf_node) != count:
@@ -140,10 +142,10 @@ def order_strips(
     return Sequences(tree.order[order], starts[: sequences + 1].copy())
 
 
-def _join_in_rounds(
-    faces: Faces, ring: Counts, tree: "ObjectTree", options: OrderingOptions
-) -> kernels.State:
+def _join_in_rounds(faces: Faces, ring: Counts, tree: "ObjectTree", options: OrderingOptions) -> "State":
     """The links after the last round: propose, match, join until no sequence is active."""
+    from striptools.kernels import strip_ordering as kernels
+
     count = len(faces)
     leaves = tree.leaf_node[tree.order]
     state = kernels.State(
