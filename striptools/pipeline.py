@@ -11,7 +11,7 @@ from typing import IO
 
 import numpy as np
 
-from striptools.errors import UnreadableMeshError
+from striptools.errors import UnreadableMeshError, UsageError
 from striptools.hierarchies.strip_bvh import build_strip_hierarchy
 from striptools.mesh.adjacency import build_adjacency
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
@@ -41,6 +41,9 @@ class Options:
         ordering: Strip-RT.
         remap: Keep the source face and first corner of every triangle in the scene.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
+
+    Raises:
+        UsageError: `threads` is below 1.
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)
@@ -48,6 +51,10 @@ class Options:
     ordering: OrderingOptions = field(default_factory=OrderingOptions)
     remap: bool = True
     threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.threads is not None and self.threads < 1:
+            raise UsageError(f"not a number of threads: {self.threads}", remedy="give 1 or more")
 
 
 @dataclass(frozen=True)
