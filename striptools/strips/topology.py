@@ -168,16 +168,18 @@ def classic_strips(strips: Strips, restart: int = RESTART) -> Counts:
         raise UsageError(
             "a triangle has a repeated vertex", where="classic_strips", remedy="clean the mesh first"
         )
+    if len(rows) == 0:
+        return np.zeros(0, np.int32)
     firsts = strips.starts[:-1]
     lasts = strips.starts[1:] - 1
     # A first triangle left by c -> a is turned once more, so that every strip starts with a turn of bit 0.
-    leaving = np.append(strips.turns[1:], False)
+    leaving = np.roll(strips.turns, -1)
     leaving[lasts] = False
     rows[firsts] = np.where(leaving[firsts, None], np.roll(rows[firsts], -1, axis=1), rows[firsts])
     leaving[firsts] = False
     # A swap repeats corner 0 or 1 before the newest vertex wherever a triangle is left by the turn it was
     # entered by.
-    entered = np.append(False, leaving[:-1])
+    entered = np.roll(leaving, 1)
     swaps = leaving == entered
     swaps[firsts] = False
     swaps[lasts] = False
@@ -252,7 +254,7 @@ def _written(rows: Faces, pivots: Counts, swaps: Bools, firsts: Counts, restart:
     ahead = swaps.astype(np.int64)
     ahead[firsts] = 3
     at = np.cumsum(ahead + 1) - 1
-    out = np.zeros(int(at[-1]) + 1 if len(at) else 0, np.int32)
+    out = np.zeros(int(at[-1]) + 1, np.int32)
     out[at] = rows[:, 2]
     out[at[swaps] - 1] = pivots[swaps]
     out[at[firsts] - 1] = rows[firsts, 1]
