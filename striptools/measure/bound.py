@@ -1,0 +1,259 @@
+"""How far a float32 tracer may stray: what one ray and one face say for certain, and within what bound.
+
+Source: the watertight test of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1),
+2013; gamma_n = n u / (1 - n u), u = 2^-24, after Higham, "Accuracy and Stability of Numerical Algorithms",
+chapter 3.
+
+The test. Let a = v - o for a vertex v and the ray's origin o, z the axis on which the direction d is largest,
+x and y the others, S = (d_x, d_y) / d_z, so |S_x|, |S_y| <= 1. The vertex is sheared onto p = (a_x - S_x a_z,
+a_y - S_y a_z), which makes the ray the point 0 of a plane. Corner i is weighed by U_i = p_j x p_k (j, k the
+other two, in turn), det = U_0 + U_1 + U_2. The ray hits where no two U_i differ in sign and det is not 0, at
+t = sum U_i (a_z)_i / d_z / det. M is the largest |component of a| over the face's corners.
+
+The bound, term by term. Everything below is a bound for every order of operations that the tracer may choose,
+with multiplications by a reciprocal instead of divisions, fused or not.
+
+1. A sheared vertex. a_x has one rounding; S_x a_z has five (reciprocal, product, a_z, product, difference
+   counted once for both). So each coordinate of p moves by at most gamma_7 M, the point by
+
+       delta_v = sqrt(2) gamma_7 M + sqrt(3) D + 2^-122,
+
+   where D is the distance by which the scene's vertices may lie off the source's (`error_bound`; the shear
+   stretches a displacement by at most sqrt(3)), and the last term covers flushed denormals. A vertex moves by
+   the SAME vector in every face that shares it, and U_i changes sign bit for bit when its edge is run the
+   other way: so the float32 test is the exact test of a slightly moved, still closed surface, except for the
+   rounding of U_i itself:
+2. An edge function. Two products and a difference: rho_i = gamma_3 (|p_j| + delta_v)(|p_k| + delta_v) +
+   2^-124.
+3. A sign that is certain ("clear"): s U_i > delta_v (|p_j| + |p_k|) + delta_v^2 + 3 rho_i. The first two
+   terms are the most that two moved vertices can change a cross product; three times rho_i instead of one
+   also rules out that wrongly rounded spokes conspire (see `aimed`: a link edge seen under 180 degrees less 2
+   gamma would be needed).
+4. An orientation that is certain: |det| > delta_v (perimeter) + 3 delta_v^2 + 2 sum rho_i; what remains is
+   det_low.
+5. What the test may accept. Each computed U_i has the sign of det or is 0, so s U_i >= -(delta_v (|p_j| +
+   |p_k|) + delta_v^2 + rho_i) for every edge. Besides, the ray lies within 8 delta_v of the face (of its
+   lines and of its box): delta_v for the moved face, less than 7 for the rounding, which moves a line by
+   gamma_3 of its edge. Where the orientation is unclear, that is for faces seen edge-on, both signs s are
+   tried, and the 8 delta_v are a demand: rounding alone could accept an edge-on face far away.
+6. t. The reported z is a convex combination of the z_i, so z lies in [min z_i, max z_i] and
+
+       |z - z_exact| <= min(|grad z| delta_v + sum rho_i |z_i - z_exact| / det_low, max z_i - min z_i) +
+       gamma_12 M + D,
+
+   with grad z the slope of the face's plane over the sheared plane: the tangent of the angle of incidence,
+   which is how the error grows like 1/|cos| at grazing rays. z_exact is the plane's z at the ray, clamped to
+   the face's range. The last rounding terms are those of the sum itself (a_z, 1/d_z, three products, four
+   sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for products that
+   underflow.
+7. u and v come from the same weights. Weights of one sign make sum U_i p_i / det a point of the moved face,
+   within stray = sum rho_i (|p_i| + delta_v) / det_low of the ray; u and v have four more roundings. So the
+   point (1-u-v) v0 + u v1 + v v2 of the source's corners lies within delta_v + min(stray, max |p_i|) +
+   gamma_16 M of the ray in the sheared plane, and its z within gamma_16 M + D of t d_z.
+
+The bound holds while no product overflows: M < 2^40. Beyond that nothing is called certain. Its own
+arithmetic is float64, whose rounding is 2^-29 of the terms above.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+UNIT_ROUNDOFF = 2.0**-24
+LARGEST_COORDINATE = 2.0**40
+FLUSHED = 2.0**-122
+BEYOND_FACE = 8.0
+"""How many delta_v from the ray a face may lie and still be reported (term 5 of the head)."""
+
+
+def gamma(n: int) -> float:
+    """The relative error of n float32 roundings in a row, gamma_n = n u / (1 - n u)."""
+    return n * UNIT_ROUNDOFF / (1 - n * UNIT_ROUNDOFF)
+
+
+@dataclass(frozen=True)
+class RayFrames:
+    """Rays taken from float32 to float64, each with the axes and shear that make it the origin of a plane.
+
+    Attributes:
+        origins: (r, 3) float64.
+        directions: (r, 3) float64, as given: t is in units of their length.
+        axes: (r, 3) intp, the axes x, y and z of the shear; z is the one on which the direction is largest.
+        shear: (r, 2) float64, d_x / d_z and d_y / d_z.
+        depth: (r,) float64, d_z.
+        valid: (r,) bool; False for a ray with a non-finite component or a zero direction, which hits nothing.
+    """
+
+    origins: np.ndarray
+    directions: np.ndarray
+    axes: np.ndarray
+    shear: np.ndarray
+    depth: np.ndarray
+    valid: np.ndarray
+
+
+def frame_rays(origins: np.ndarray, directions: np.ndarray) -> RayFrames:
+    """Take float32 rays, (r, 3) origins and directions, into float64 exactly and choose their axes."""
+    o = np.asarray(origins, np.float32).astype(np.float64).reshape(-1, 3)
+    d = np.asarray(directions, np.float32).astype(np.float64).reshape(-1, 3)
+    valid = np.isfinite(o).all(axis=1) & np.isfinite(d).all(axis=1) & (d != 0).any(axis=1)
+    o = np.where(valid[:, None], o, 0.0)
+    d = np.where(valid[:, None], d, np.array([0.0, 0.0, 1.0]))
+    z = np.argmax(np.abs(d), axis=1)
+    axes = np.stack([(z + 1) % 3, (z + 2) % 3, z], axis=1)
+    turned = np.take_along_axis(d, axes, axis=1)
+    return RayFrames(o, d, axes, turned[:, :2] / turned[:, 2:], turned[:, 2].copy(), valid)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What pairs of one ray and one face say, in the order of the pairs; the module's head derives each.
+
+    Attributes:
+        t: (k,) float64, t of the face's plane at the ray, clamped to the face's own range; 0 at a face
+            without area.
+        t_bound: (k,) float64, by how much a float32 tracer's t of this face may differ from it.
+        u: (k,) float64, the weight of the second corner, unclamped.
+        v: (k,) float64, the weight of the third corner, unclamped.
+        inside: (k,) bool, the exact answer: the ray meets the face, its border included, at t > 0.
+        possible: (k,) bool, a float32 tracer may report this face.
+        side: (k,) int8, +1 where the ray certainly sees the corners counter-clockwise, -1 clockwise, 0
+            unclear. (In the sheared plane of `RayFrames.axes` a negative `depth` mirrors; `side` is what is
+            seen.)
+        clear: (k, 3) bool, the ray certainly lies on the inner side of the edge opposite each corner.
+        ahead: (k,) bool, t is certainly positive.
+        lateral: (k,) float64, the bound on the distance between the ray and a reported hit, in the sheared
+            plane.
+        depth_error: (k,) float64, the bound on the difference of z between t d and the point of u and v.
+    """
+
+    t: np.ndarray
+    t_bound: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    inside: np.ndarray
+    possible: np.ndarray
+    side: np.ndarray
+    clear: np.ndarray
+    ahead: np.ndarray
+    lateral: np.ndarray
+    depth_error: np.ndarray
+
+    @property
+    def certain(self) -> np.ndarray:
+        """(k,) bool: every float32 tracer within the bound accepts this face for this ray."""
+        return (self.side != 0) & self.clear.all(axis=1) & self.ahead
+
+    @property
+    def farthest(self) -> np.ndarray:
+        """(k,) float64: the largest t that a tracer may report for this face."""
+        return self.t + self.t_bound
+
+
+def shear_points(frames: RayFrames, ray: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (k, ..., 3) as rays number `ray`, (k,), see them: sheared x and y, and z along the main axis."""
+    shape = (len(ray),) + (1,) * (points.ndim - 2)
+    a = points - frames.origins[ray].reshape(*shape, 3)
+    a = np.take_along_axis(a, np.broadcast_to(frames.axes[ray].reshape(*shape, 3), a.shape), axis=-1)
+    a[..., :2] -= frames.shear[ray].reshape(*shape, 2) * a[..., 2:]
+    return a
+
+
+def lateral_slack(largest: np.ndarray, error_bound: float) -> np.ndarray:
+    """delta_v for corners that lie within `largest` of the ray's origin on every axis."""
+    slack = np.sqrt(2.0) * gamma(7) * largest + np.sqrt(3.0) * error_bound + FLUSHED
+    return np.where(largest < LARGEST_COORDINATE, slack, np.inf)
+
+
+def judge_pairs(frames: RayFrames, ray: np.ndarray, corners: np.ndarray, error_bound: float = 0.0) -> Pairs:
+    """Judge pairs of a ray and a face.
+
+    Args:
+        frames: The rays.
+        ray: (k,) index of each pair's ray.
+        corners: (k, 3, 3) float64, the face's corners, whose components are float32 values.
+        error_bound: D, how far the traced vertices may lie off these, in the model's unit.
+    """
+    largest = np.abs(corners - frames.origins[ray][:, None]).max(axis=(1, 2))
+    delta_v = lateral_slack(largest, error_bound)
+    sheared = shear_points(frames, ray, corners)
+    x, y, z = sheared[..., 0].T, sheared[..., 1].T, sheared[..., 2].T
+    with np.errstate(all="ignore"):
+        plane = _PlaneView(x, y, z, delta_v)
+        depth = np.abs(frames.depth[ray])
+        z_hit, z_bound = plane.depth_and_bound(gamma(12) * largest + error_bound)
+        t_bound = z_bound / depth + np.where(plane.det_low > 0, FLUSHED / plane.det_low, 0.0)
+        t = z_hit / frames.depth[ray]
+        t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
+        alive = frames.valid[ray] & np.isfinite(sheared).all(axis=(1, 2))
+        side = np.where(plane.det_low > 0, np.sign(plane.det) * np.sign(frames.depth[ray]), 0.0)
+        return Pairs(
+            t=t,
+            t_bound=t_bound,
+            u=plane.weight(1),
+            v=plane.weight(2),
+            inside=alive & plane.inside() & (t > 0),
+            possible=alive & plane.acceptable() & (t + t_bound > 0),
+            side=np.where(alive, side, 0).astype(np.int8),
+            clear=plane.clear_edges() & alive[:, None],
+            ahead=t - t_bound > 0,
+            lateral=plane.stray() + gamma(16) * largest,
+            depth_error=gamma(16) * largest + error_bound,
+        )
+
+
+class _PlaneView:
+    """Faces in the plane in which their ray is the point 0: rows of `x`, `y`, `z`, `r`, `U` are corners."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, delta_v: np.ndarray) -> None:
+        self.x, self.y, self.z, self.delta_v = x, y, z, delta_v
+        j, k = [1, 2, 0], [2, 0, 1]
+        self.cross = x[j] * y[k] - y[j] * x[k]
+        self.edge = np.hypot(x[k] - x[j], y[k] - y[j])
+        self.r = np.hypot(x, y)
+        self.rho = gamma(3) * (self.r[j] + delta_v) * (self.r[k] + delta_v) + FLUSHED / 4
+        self.swing = delta_v * (self.r[j] + self.r[k] + delta_v)
+        self.det = self.cross.sum(axis=0)
+        det_error = delta_v * self.edge.sum(axis=0) + 3 * delta_v**2 + 2 * self.rho.sum(axis=0)
+        self.det_low = np.abs(self.det) - det_error
+
+    def inside(self) -> np.ndarray:
+        one_sign = (self.cross >= 0).all(axis=0) | (self.cross <= 0).all(axis=0)
+        return one_sign & (self.det != 0)
+
+    def weight(self, corner: int) -> np.ndarray:
+        return np.where(self.det != 0, self.cross[corner] / np.where(self.det != 0, self.det, 1.0), 0.0)
+
+    def clear_edges(self) -> np.ndarray:
+        return (np.sign(self.det) * self.cross > self.swing + 3 * self.rho).T
+
+    def stray(self) -> np.ndarray:
+        """How far from the ray the point meant by computed weights may lie."""
+        rounding = (self.rho * (self.r + self.delta_v)).sum(axis=0) / self.det_low
+        farthest = self.r.max(axis=0)
+        return self.delta_v + np.where(self.det_low > 0, np.minimum(rounding, farthest), farthest)
+
+    def acceptable(self) -> np.ndarray:
+        reach = BEYOND_FACE * self.delta_v
+        slack = np.minimum(self.swing + self.rho, reach * self.edge)
+        counter_clockwise = (self.cross >= -slack).all(axis=0)
+        clockwise = (self.cross <= slack).all(axis=0)
+        either = np.where(self.det > 0, counter_clockwise, clockwise)
+        either |= (self.det_low <= 0) & (counter_clockwise | clockwise)
+        boxed = (self.x.min(axis=0) <= reach) & (self.x.max(axis=0) >= -reach)
+        return either & boxed & (self.y.min(axis=0) <= reach) & (self.y.max(axis=0) >= -reach)
+
+    def depth_and_bound(self, rounding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth of the face's plane at the ray, clamped to the face's range, and the bound of its error."""
+        x, y, z = self.x, self.y, self.z
+        low, high = z.min(axis=0), z.max(axis=0)
+        det = np.where(self.det != 0, self.det, 1.0)
+        depth = np.where(self.det != 0, (self.cross * (z - z[0])).sum(axis=0) / det + z[0], z[0])
+        depth = np.clip(depth, low, high)
+        rise_1, rise_2 = z[1] - z[0], z[2] - z[0]
+        slope_x = rise_1 * (x[2] - x[0]) - rise_2 * (x[1] - x[0])
+        slope_y = rise_1 * (y[2] - y[0]) - rise_2 * (y[1] - y[0])
+        slope = np.hypot(slope_x, slope_y) / np.abs(det)
+        stray = slope * self.delta_v + (self.rho * np.abs(z - depth)).sum(axis=0) / self.det_low
+        stray = np.where(self.det_low > 0, stray, np.inf)
+        return depth, np.minimum(stray, high - low) + rounding

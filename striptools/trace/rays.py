@@ -1,0 +1,196 @@
+"""Rays made on the host: a pinhole camera that frames the model, and cosine-distributed secondary rays.
+
+All arithmetic is float64 NumPy; what comes out is float32, the rays as every tracer takes them. The same
+arguments give the same rays.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from striptools.errors import UsageError
+from striptools.types import RayVectors
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+UP_CHOICES = ("x", "y", "z", "-x", "-y", "-z")
+THREE_QUARTER = (0.55, 0.38, 1.0)
+"""The default place of the eye, as right, up and front parts: the front, a little to the right and above."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with square pixels.
+
+    Attributes:
+        eye: (3,) float64, the model's unit.
+        right: (3,) float64, unit vector to the picture's right.
+        up: (3,) float64, unit vector to the picture's top.
+        forward: (3,) float64, unit vector into the picture.
+        tangent: The tangent of half the angle of view, across the shorter side of the picture.
+        width: Pixels across.
+        height: Pixels down.
+    """
+
+    eye: Float64[np.ndarray, " 3"]
+    right: Float64[np.ndarray, " 3"]
+    up: Float64[np.ndarray, " 3"]
+    forward: Float64[np.ndarray, " 3"]
+    tangent: float
+    width: int
+    height: int
+
+    @classmethod
+    def framing(
+        cls,
+        points: np.ndarray,
+        *,
+        width: int = 800,
+        height: int = 600,
+        fov: float = 35.0,
+        view: tuple[float, float, float] = THREE_QUARTER,
+        up: str = "y",
+        margin: float = 0.06,
+    ) -> "Camera":
+        """A camera that holds every point as large as the picture allows, and in its middle.
+
+        Args:
+            points: (k, 3), vertices or corners of a box; non-finite ones are left out.
+            width: Pixels across.
+            height: Pixels down.
+            fov: Angle of view across the shorter side, in degrees, above 0 and below 170.
+            view: Where the eye is, seen from the model: right, up and front parts, of any length.
+            up: The model's axis that points to the picture's top, one of `UP_CHOICES`.
+            margin: The part of the picture left free at each side, 0 to below 0.5.
+
+        Raises:
+            UsageError: An argument is out of range.
+        """
+        if width < 1 or height < 1 or not 0 < fov < 170 or not 0 <= margin < 0.5:
+            raise UsageError(f"no camera of {width} x {height} pixels, {fov} degrees and margin {margin}")
+        right, top, forward = _turned_axes(view, up)
+        points = np.asarray(points, np.float64).reshape(-1, 3)
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points) == 0:
+            points = np.zeros((1, 3))
+        tangent = float(np.tan(np.radians(fov) / 2))
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        seen = (points - middle) @ np.stack([right, top, forward], axis=1)
+        spread = tangent * np.array([width, height]) / min(width, height) * (1 - 2 * margin)
+        place = _eye_before(seen, spread)
+        eye = middle + place[0] * right + place[1] * top + place[2] * forward
+        return cls(eye, right, top, forward, tangent, int(width), int(height))
+
+
+def _turned_axes(view: tuple[float, float, float], up: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right, up and forward of a camera that looks from `view` at the middle, in the model's axes."""
+    if up not in UP_CHOICES:
+        raise UsageError(f"up is {up!r}", remedy=f"one of {', '.join(UP_CHOICES)} is wanted")
+    top = np.array(AXES[up[-1]]) * (-1.0 if up.startswith("-") else 1.0)
+    front = np.array(AXES["y"]) * -1.0 if up[-1] != "y" else np.array(AXES["z"])
+    aside = np.cross(top, front)
+    place = np.asarray(view, np.float64) @ np.stack([aside, top, front])
+    length = np.linalg.norm(place)
+    if not np.isfinite(length) or length == 0:
+        raise UsageError(f"view is {view}", remedy="a direction other than zero is wanted")
+    forward = -place / length
+    right = np.cross(forward, top)
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, -front)
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, forward), forward
+
+
+def _eye_before(seen: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """The eye nearest to points in camera axes that holds them all within `spread` (tangents across and up).
+
+    A point is held across where |x - x_eye| <= s (z - z_eye): the largest of x - s z and the smallest of x +
+    s z are all that matters. The axis that needs more room sets the distance; on the other the eye is
+    centred.
+    """
+    side = seen[:, :2]
+    reach = spread * seen[:, 2:]
+    greatest = (side - reach).max(axis=0)
+    least = (side + reach).min(axis=0)
+    depth = float(((least - greatest) / (2 * spread)).min())
+    nearest = float(seen[:, 2].min())
+    size = float(np.abs(seen).max())
+    depth = min(depth, nearest - max(0.05 * size, 1e-30))
+    return np.array([*((greatest + least) / 2), depth])
+
+
+def camera_rays(camera: Camera, samples: int = 1) -> tuple[RayVectors, RayVectors]:
+    """Rays of a camera, of unit length, in pixel order: row by row from the top left.
+
+    Args:
+        camera: The camera.
+        samples: n for n x n rays a pixel, one in the middle of each part; a pixel's rays follow each other.
+
+    Returns:
+        Origins and directions, (height * width * samples^2, 3) float32.
+
+    Raises:
+        UsageError: `samples` is less than 1.
+    """
+    if samples < 1:
+        raise UsageError(f"{samples} samples a pixel", remedy="at least 1 is wanted")
+    part = (np.arange(samples) + 0.5) / samples
+    shorter = min(camera.width, camera.height)
+    x = (2 * (np.arange(camera.width)[:, None] + part) - camera.width) / shorter * camera.tangent
+    y = (camera.height - 2 * (np.arange(camera.height)[:, None] + part)) / shorter * camera.tangent
+    across = x[None, :, None, :, None] * camera.right
+    upward = y[:, None, :, None, None] * camera.up
+    directions = (camera.forward + across + upward).reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(camera.eye.astype(np.float32), directions.shape)
+    return np.ascontiguousarray(origins), directions.astype(np.float32)
+
+
+def cosine_rays(
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    count: int = 1,
+    seed: int = 0,
+    offset: float | np.ndarray = 0.0,
+) -> tuple[RayVectors, RayVectors]:
+    """Secondary rays of unit length, distributed by the cosine about the normals, as in ambient occlusion.
+
+    Malley's method: a point of the unit disk, lifted to the hemisphere (Pharr, Jakob and Humphreys,
+    "Physically Based Rendering", 4th edition, A.5.3). The tangent frame is that of Duff et al., "Building an
+    Orthonormal Basis, Revisited", JCGT 6(1), 2017.
+
+    Args:
+        points: (k, 3) points on the surface.
+        normals: (k, 3) unit normals on the side that the rays leave to.
+        count: Rays a point; a point's rays follow each other.
+        seed: Of the random numbers.
+        offset: By how much an origin is lifted off the surface along the normal, in the model's unit; one
+            number or one a point.
+
+    Returns:
+        Origins and directions, (k * count, 3) float32.
+    """
+    points = np.repeat(np.asarray(points, np.float64), count, axis=0)
+    normals = np.repeat(np.asarray(normals, np.float64), count, axis=0)
+    lift = np.repeat(np.broadcast_to(np.asarray(offset, np.float64), len(points) // max(count, 1)), count)
+    uniform = np.random.default_rng(seed).random((len(points), 2))
+    radius, angle = np.sqrt(uniform[:, 0]), 2 * np.pi * uniform[:, 1]
+    height = np.sqrt(np.maximum(0.0, 1 - uniform[:, 0]))
+    tangent, bitangent = _tangent_frame(normals)
+    directions = (
+        tangent * (radius * np.cos(angle))[:, None]
+        + bitangent * (radius * np.sin(angle))[:, None]
+        + normals * height[:, None]
+    )
+    return (points + normals * lift[:, None]).astype(np.float32), directions.astype(np.float32)
+
+
+def _tangent_frame(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, y, z = normals.T
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1), np.stack(
+        [b, sign + y * y * a, -y], axis=1
+    )
