@@ -227,7 +227,7 @@ def comes_before(positions, a, b):
 
 @njit(cache=True, nogil=True)
 def fill_leaf_blocks(
-    positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_ids, place
+    positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_bits, place
 ):
     """Write the triangles of each leaf, lane by lane, in the one corner order that all tests use.
 
@@ -242,8 +242,8 @@ def fill_leaf_blocks(
         scale: float32 power of two that positions are multiplied by.
         leaf_first: (l,) int32.
         leaf_count: (l,) int32.
-        blocks: (>= l, 9, 8) float32, written: corner a xyz, b xyz, c xyz; other lanes untouched.
-        block_ids: (>= l, 8) int32, written.
+        blocks: (>= l, 10, 8) float32, written: corner a xyz, b xyz, c xyz; other lanes untouched.
+        block_bits: The same memory as int32; row 9 is written: the reported faces.
         place: (>= max(ids) + 1,) int32, written: `(leaf * 8 + lane) * 4 + turn` of each face, where
             canonical corner j is the reported face's corner (j + turn) % 3.
     """
@@ -258,5 +258,5 @@ def fill_leaf_blocks(
                 corner = faces[t, (j + turn) % 3]
                 for axis in range(3):
                     blocks[q, 3 * j + axis, lane] = positions[corner, axis] * scale
-            block_ids[q, lane] = ids[t]
+            block_bits[q, 9, lane] = ids[t]
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3

@@ -33,7 +33,7 @@ TINY = np.float32(2**-60)
 
 
 class Slab(NamedTuple):
-    """The ray as the box test sees it: its origin for low sides and for high sides, and inverse directions."""
+    """its origin for low and for high sides, and inverse directions."""
 
     low: Array
     high: Array

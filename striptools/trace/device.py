@@ -128,7 +128,7 @@ def prepare_jax(environ: MutableMapping[str, str] = os.environ) -> None:
         raise MissingExtraError(
             "tracing needs JAX, which is not installed", remedy='pip install "striptools[trace]"'
         ) from error
-    if jax.config.jax_compilation_cache_dir is None and (folder := cache_folder(environ)) is not None:
+    if jax.config.read("jax_compilation_cache_dir") is None and (folder := cache_folder(environ)) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if not set_cpu_devices(cores, environ) and not hoisted_before:
@@ -144,7 +144,7 @@ def set_cpu_devices(count: int, environ: MutableMapping[str, str]) -> bool:
     """Ask JAX for that many CPU devices, unless the user did; say whether its backend was still down."""
     import jax
 
-    wanted = jax.config.jax_num_cpu_devices
+    wanted = jax.config.read("jax_num_cpu_devices")
     if wanted < 0 and "--xla_force_host_platform_device_count" not in environ.get("XLA_FLAGS", ""):
         wanted = count
     try:

@@ -15,6 +15,8 @@ from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
+CACHE_LINE = 64
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -46,8 +48,8 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
     wide = collapse(tree)
     scale = scale_of(scene)
     leaves = len(wide.leaf_first)
-    blocks = np.full((size_class(leaves), 9, WIDTH), np.nan, np.float32)
-    block_ids = np.full((len(blocks), WIDTH), NO_FACE, np.int32)
+    blocks = aligned_full((size_class(leaves), 10, WIDTH), np.nan)
+    blocks[:, 9] = NO_FACE.view(np.float32)
     face_count = int(ids.max()) + 1
     place = np.zeros(size_class(face_count), np.int32)
     fill_leaf_blocks(
@@ -59,14 +61,14 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
         wide.leaf_first,
         wide.leaf_count,
         blocks,
-        block_ids,
+        blocks.view(np.int32),
         place,
     )
     triangle_of = np.full(face_count, -1, np.int32)
     triangle_of[ids] = np.arange(len(ids), dtype=np.int32)
     boxes, child = _nodes(wide, scale)
     reach = np.float32(np.abs(scene.positions).max() * scale)
-    return Layout(WideScene(boxes, child, blocks, block_ids, place, scale, reach), triangle_of, wide.depth)
+    return Layout(WideScene(boxes, child, blocks, place, scale, reach), triangle_of, wide.depth)
 
 
 def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
@@ -79,7 +81,7 @@ def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndar
 def _nodes(wide: WideTree, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
     """Wide nodes as the walk reads them: scaled, empty lanes not a number, padded to a size class."""
     count = len(wide.boxes)
-    boxes = np.full((size_class(count), 6, WIDTH), np.nan, np.float32)
+    boxes = aligned_full((size_class(count), 6, WIDTH), np.nan)
     np.multiply(wide.boxes, scale, out=boxes[:count])
     np.copyto(boxes[:count], np.nan, where=(wide.child == EMPTY)[:, None])
     child = np.full(WIDTH * len(boxes) + 2 * WIDTH, DONE, np.int32)
@@ -109,3 +111,11 @@ def size_class(count: int) -> int:
         quarters = round(4 * np.log2(size)) + 1
         size = int(np.ceil(2 ** (quarters / 4)))
     return size
+
+
+def aligned_full(shape: tuple[int, ...], value: float) -> np.ndarray:
+    """A float32 array that starts at a cache line: CPU devices use such arrays where they lie, uncopied."""
+    count = int(np.prod(shape))
+    memory = np.full(count + CACHE_LINE // 4, value, np.float32)
+    start = -memory.ctypes.data % CACHE_LINE // 4
+    return memory[start : start + count].reshape(shape)

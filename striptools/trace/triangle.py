@@ -33,7 +33,7 @@ CornerLoader = Callable[[int, Array], Array]
 
 
 class Shear(NamedTuple):
-    """The ray as the test sees it: axes (z dominant), origin along them, and the shear that sets it upright."""
+    """A ray as the test sees it: axes (z dominant), origin along them, and the shear that sets it upright."""
 
     axes: tuple[Array, Array, Array]
     origin: tuple[Array, Array, Array]
@@ -65,18 +65,20 @@ def shear_of(origin: Array, direction: Array) -> Shear:
     x = jnp.where(z == 2, 0, z + 1)
     y = jnp.where(x == 2, 0, x + 1)
 
-    def along(vector: Array, axis: Array) -> Array:
-        return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
-
-    depth = along(direction, z)
+    depth = pick(direction, z)
     axes = (x.astype(jnp.uint32), y.astype(jnp.uint32), z.astype(jnp.uint32))
     return Shear(
         axes,
-        (along(origin, x), along(origin, y), along(origin, z)),
-        along(direction, x) / depth,
-        along(direction, y) / depth,
+        (pick(origin, x), pick(origin, y), pick(origin, z)),
+        pick(direction, x) / depth,
+        pick(direction, y) / depth,
         1 / depth,
     )
+
+
+def pick(vector: Array, axis: Array) -> Array:
+    """The coordinate of a (3,) vector along an axis."""
+    return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
 
 def edges_of(corner: CornerLoader, shear: Shear) -> Edges:

@@ -18,6 +18,9 @@ inside a `lax.cond` is copied; a loop is hoisted only while nothing in it scatte
 The steps of a walk are bounded: a tree that goes round in a circle ends in `STUCK`, not in a hang.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +30,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met, slab_of
 from striptools.trace.numerics import index, larger, power_of_two_below, smaller
-from striptools.trace.triangle import Shear, crossing_of, edges_of, shear_of
+from striptools.trace.triangle import Edges, Shear, crossing_of, edges_of, pick, shear_of
 
 WIDTH = 8
 DONE = np.int32(-(2**31))
@@ -47,8 +50,8 @@ class WideScene(NamedTuple):
     Attributes:
         boxes: (w, 6, 8) float32, NaN in empty lanes.
         child: (8 w + 16,) int32, as in `WideTree`, then `DONE`.
-        blocks: (l, 9, 8) float32, corners of each leaf's triangles by lane, NaN in empty lanes.
-        ids: (l, 8) int32, the face of each.
+        blocks: (l, 10, 8) float32, corner a xyz, b xyz, c xyz of each leaf's triangles by lane, NaN in empty
+            lanes, then the bits of their faces (int32): a leaf is 320 bytes in a row.
         place: (f,) int32, of each face: (leaf * 8 + lane) * 4 + turn, see `kernels.wide.fill_leaf_blocks`.
         scale: () float32, the power of two that positions were multiplied by.
         reach: () float32, the largest scaled coordinate.
@@ -57,7 +60,6 @@ class WideScene(NamedTuple):
     boxes: Any
     child: Any
     blocks: Any
-    ids: Any
     place: Any
     scale: Any
     reach: Any
@@ -92,15 +94,45 @@ class Traced(NamedTuple):
 
 
 class _Ray(NamedTuple):
-    """What stays the same all along a walk."""
+    """What stays the same all along a walk, in as few arrays as can be: a loop pays for each.
 
-    slab: Slab
-    shear: Shear
-    mirror: Array  # exclusive-or of a lane and its place in the order of visits
+    Attributes:
+        floats: (17,) float32: what the properties name.
+        ints: (5,) int32: axes of the shear, mirror, whether the ray is one.
+        lane_bits: (8,) int32, the bit that stands for each lane, the nearest highest.
+    """
+
+    floats: Array
+    ints: Array
     lane_bits: Array
-    t_max: Array
-    t_unit: Array  # t of the walk in units of the caller's t
-    valid: Array
+
+    @property
+    def slab(self) -> Slab:
+        return Slab(self.floats[0:3], self.floats[3:6], self.floats[6:9])
+
+    @property
+    def shear(self) -> Shear:
+        x, y, z = (index(self.ints[k]) for k in range(3))
+        origin = (self.floats[9], self.floats[10], self.floats[11])
+        return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14])
+
+    @property
+    def t_max(self) -> Array:
+        return self.floats[15]
+
+    @property
+    def t_unit(self) -> Array:
+        """T of the walk in units of the caller's t."""
+        return self.floats[16]
+
+    @property
+    def mirror(self) -> Array:
+        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
+        return self.ints[3]
+
+    @property
+    def valid(self) -> Array:
+        return self.ints[4] != 0
 
 
 class _Place(NamedTuple):
@@ -133,21 +165,34 @@ def trace_rays(
         options: What to compile in.
     """
     groups = len(origins) // options.interleave
-    rays = (
-        origins.reshape(groups, options.interleave, 3),
-        directions.reshape(groups, options.interleave, 3),
-        t_max.reshape(groups, options.interleave),
-    )
+    prepared = jax.vmap(lambda *ray: _prepare(scene, *ray))(origins, directions, t_max)
+    floats, ints = (a.reshape(groups, options.interleave, -1) for a in prepared)
+    end = len(scene.child) // WIDTH - 2
 
-    def walk(group: tuple[Array, Array, Array]) -> Traced:
-        return _walk_group(scene, *group, options)
+    # The bottom of a stack is a node whose every child is DONE.
+    floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
+    stacks = (floor,) * options.interleave
 
-    traced = jax.vmap(walk)(rays) if options.batch else lax.map(walk, rays)
-    return Traced(*(a.reshape(-1) for a in traced))
+    def walk(stacks: tuple[Array, ...], group: tuple[Array, Array]) -> tuple[tuple[Array, ...], _Walked]:
+        return _walk_group(scene, group, stacks, options)
+
+    if options.batch:
+        walked = jax.vmap(lambda group: walk(stacks, group)[1])((floats, ints))
+    else:
+        # One group's stacks serve the next: only their bottom is read before it is written.
+        walked = lax.scan(walk, stacks, (floats, ints))[1]
+    t, face, steps = (a.reshape(-1) for a in walked)
+    if options.any_hit:
+        nothing = jnp.zeros(0)
+        return Traced(nothing, face, nothing, nothing, nothing)
+    return Traced(t, face, *weights_of(scene, origins, directions, face), steps)
 
 
-def _prepare(scene: WideScene, origin: Array, direction: Array, t_max: Array) -> _Ray:
-    """Scale a ray by powers of two, so that neither the model's unit nor the direction's length matters."""
+def _prepare(scene: WideScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
+    """Floats and ints of a `_Ray`.
+
+    A ray is scaled by powers of two: neither the model's unit nor the direction's length matters after that.
+    """
     size = jnp.abs(direction)
     longest = larger(larger(size[0], size[1]), size[2])
     shorten, length = power_of_two_below(longest)
@@ -155,17 +200,13 @@ def _prepare(scene: WideScene, origin: Array, direction: Array, t_max: Array) ->
     finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
     valid = finite & (longest >= np.finfo(np.float32).tiny) & (t_max > 0)
     direction = direction * shorten
-    octant = jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
-    mirror = 7 ^ octant
-    lanes = jnp.arange(WIDTH, dtype=jnp.int32)
-    return _Ray(
-        slab_of(origin, direction, scene.reach),
-        shear_of(origin, direction),
-        mirror,
-        jnp.int32(1) << (lanes ^ mirror),
-        t_max * length * scene.scale,
-        shorten / scene.scale,
-        valid,
+    mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
+    slab = slab_of(origin, direction, scene.reach)
+    shear = shear_of(origin, direction)
+    rest = [*shear.origin, shear.x, shear.y, shear.z, t_max * length * scene.scale, shorten / scene.scale]
+    floats = jnp.concatenate([slab.low, slab.high, slab.inverse, jnp.stack(rest)])
+    return floats, jnp.stack(
+        [*(axis.astype(jnp.int32) for axis in shear.axes), mirror, valid.astype(jnp.int32)]
     )
 
 
@@ -210,7 +251,8 @@ def _visit_leaf(scene: WideScene, ray: _Ray, child: Array, best: _Best, any_hit:
         )[0, 0]
 
     inside, t = crossing_of(edges_of(corner, ray.shear))
-    face = lax.dynamic_slice(scene.ids, (leaf, jnp.uint32(0)), (1, WIDTH))[0]
+    bits = lax.dynamic_slice(scene.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
+    face = lax.bitcast_convert_type(bits, jnp.int32)
     closer = inside & (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.face)))
     t = jnp.where(closer, t, best.t)
     face = jnp.where(closer, face, best.face)
@@ -235,106 +277,144 @@ def _closest_lane(best: _Best) -> tuple[Array, Array]:
     return t[0], jnp.where(face[0] == NO_FACE, MISS, face[0])
 
 
-def _weights(scene: WideScene, ray: _Ray, face: Array) -> tuple[Array, Array]:
-    """The weights u and v of a hit, by the corners of the face that is reported."""
-    place = lax.dynamic_slice(scene.place, (index(larger(face, jnp.int32(0))),), (1,))[0]
-    leaf, lane, turn = place >> 5, (place >> 2) & 7, place & 3
+def weights_of(scene: WideScene, origins: Array, directions: Array, face: Array) -> tuple[Array, Array]:
+    """The weights u and v of r hits, by the corners of the faces that are reported.
 
-    def corner(k: int, axis: Array) -> Array:
-        return lax.dynamic_slice(
-            scene.blocks, (index(leaf), axis + jnp.uint32(3 * k), index(lane)), (1, 1, 1)
-        )[0, 0, 0]
+    All rays at once, after the walk: a walk that carried u and v would be slower at every step.
+    """
+    hit = face >= 0
+    place = scene.place[index(jnp.where(hit, face, 0))]
+    corners = scene.blocks[index(place >> 5), :9, index((place >> 2) & 7)].reshape(-1, 3, 3)
+    turn = place & 3
 
-    a, b, c, _ = edges_of(corner, ray.shear)
+    def one(origin: Array, direction: Array, corners: Array) -> Edges:
+        shear = shear_of(origin * scene.scale, direction)
+
+        def corner(k: int, axis: Array) -> Array:
+            return pick(corners[k], axis)
+
+        return edges_of(corner, shear)
+
+    a, b, c, _ = jax.vmap(one)(origins, directions, corners)
     whole = a + b + c
-    whole = jnp.where((face < 0) | (whole == 0), jnp.float32(1), whole)
+    whole = jnp.where(hit & (whole != 0), whole, jnp.inf)
     a, b, c = a / whole, b / whole, c / whole
     u = jnp.where(turn == 0, b, jnp.where(turn == 1, a, c))
     v = jnp.where(turn == 0, c, jnp.where(turn == 1, b, a))
-    return jnp.where(face < 0, 0, u), jnp.where(face < 0, 0, v)
+    return jnp.where(hit, u, 0), jnp.where(hit, v, 0)
 
 
-def _walk_group(
-    scene: WideScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
-) -> Traced:
-    """Walk `options.interleave` rays side by side."""
-    count = options.interleave
-    rays = [_prepare(scene, origins[k], directions[k], t_max[k]) for k in range(count)]
-    end = len(scene.child) // WIDTH - 2
-    bound = jnp.int32(count * len(scene.boxes) + 1)
+class _Walked(NamedTuple):
+    """One entry for each ray of a group; `steps` has none where they are not counted."""
 
-    # The bottom of the stack is a node whose every child is DONE.
-    floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
-    places = tuple(
-        _Place(jnp.where(ray.valid, jnp.int32(0), DONE), jnp.int32(0), jnp.int32(0), jnp.int32(1))
-        for ray in rays
-    )
-    bests = tuple(
-        _Best(ray.t_max * SLACK, jnp.full(WIDTH, ray.t_max, jnp.float32), jnp.full(WIDTH, MISS, jnp.int32))
-        for ray in rays
-    )
-    steps = tuple(jnp.int32(0) for _ in rays) if options.count_steps else ()
+    t: Array
+    face: Array
+    steps: Array
 
-    def any_at_node(state: tuple) -> Array:
-        at_node = jnp.bool_(False)
-        for place in state[0]:
-            at_node = at_node | (place.child >= 0)
-        return at_node & (state[2] < bound)
 
-    def unfinished(state: tuple) -> Array:
-        left = jnp.bool_(False)
-        for place in state[0]:
-            left = left | (place.child != DONE)
-        return left & (state[2] < bound)
+class _State(NamedTuple):
+    """Where the rays of a group are: what an inner loop carries. It counts its turns, and steps of a ray."""
 
-    def all_visit_nodes(bests: tuple[_Best, ...], state: tuple) -> tuple:
-        places, stacks, turns, steps = state
-        visits = [_visit_node(scene, rays[k], places[k], bests[k].limit, stacks[k]) for k in range(count)]
-        steps = tuple(step + (places[k].child >= 0) for k, step in enumerate(steps))
-        return tuple(v[0] for v in visits), tuple(v[1] for v in visits), turns + 1, steps
+    places: tuple[_Place, ...]
+    stacks: tuple[Array, ...]
+    turns: Array
+    steps: tuple[Array, ...]
 
-    def leave_leaf(k: int, place: _Place, stack: Array, best: _Best) -> tuple[_Place, _Best]:
-        best = _visit_leaf(scene, rays[k], place.child, best, options.any_hit)
-        there = _next_child(scene, rays[k], place.node, place.lanes, place.height, stack)
-        if options.any_hit:
+
+@dataclass(frozen=True)
+class _Walk:
+    """The steps of the walk of one group of rays."""
+
+    scene: WideScene
+    rays: tuple[_Ray, ...]
+    options: WalkOptions
+
+    def goes_on(self, state: _State, at: Callable[[_Place], Array]) -> Array:
+        """Whether any ray is `at` a place, and the walk within its bound: each ray at each node once."""
+        found = jnp.bool_(False)
+        for place in state.places:
+            found = found | at(place)
+        return found & (state.turns <= len(self.rays) * len(self.scene.boxes))
+
+    def visit_nodes(self, state: _State, bests: tuple[_Best, ...]) -> _State:
+        """Each ray that is at an inner node visits it."""
+        visits = [
+            _visit_node(self.scene, *each)
+            for each in zip(self.rays, state.places, [b.limit for b in bests], state.stacks, strict=True)
+        ]
+        places, stacks = tuple(v[0] for v in visits), tuple(v[1] for v in visits)
+        at_node = [place.child >= 0 for place in state.places]
+        return _State(places, stacks, state.turns + 1, self.count(state.steps, at_node))
+
+    def visit_leaves(self, state: _State, bests: tuple[_Best, ...]) -> tuple[_State, tuple[_Best, ...]]:
+        """Each ray that is at a leaf tests it and goes on."""
+        at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
+        after = [
+            lax.cond(
+                at_leaf[k],
+                partial(self.leave_leaf, k, state, bests[k]),
+                partial(self.stay, k, state, bests[k]),
+            )
+            for k in range(len(self.rays))
+        ]
+        steps = self.count(state.steps, at_leaf)
+        return state._replace(places=tuple(a[0] for a in after), steps=steps), tuple(a[1] for a in after)
+
+    def leave_leaf(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
+        """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
+        ray, place = self.rays[k], state.places[k]
+        best = _visit_leaf(self.scene, ray, place.child, best, self.options.any_hit)
+        there = _next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
+        if self.options.any_hit:
             there = there._replace(child=jnp.where(best.limit < 0, DONE, there.child))
         return there, best
 
-    def nodes_then_leaves(state: tuple) -> tuple:
-        places, stacks, turns, steps, bests = state
-        places, stacks, turns, steps = lax.while_loop(
-            any_at_node, lambda s: all_visit_nodes(bests, s), (places, stacks, turns, steps)
-        )
-        after = []
-        for k in range(count):
-            at_leaf = (places[k].child < 0) & (places[k].child != DONE)
-            after.append(
-                lax.cond(
-                    at_leaf,
-                    lambda k=k: leave_leaf(k, places[k], stacks[k], bests[k]),
-                    lambda k=k: (places[k], bests[k]),
-                )
-            )
-            if steps:
-                steps = (*steps[:k], steps[k] + at_leaf, *steps[k + 1 :])
-        return tuple(a[0] for a in after), stacks, turns, steps, tuple(a[1] for a in after)
+    def stay(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
+        """Ray k is at no leaf."""
+        return state.places[k], best
 
-    places, _, _, steps, bests = lax.while_loop(
-        unfinished, nodes_then_leaves, (places, tuple(floor for _ in rays), jnp.int32(0), steps, bests)
+    def count(self, steps: tuple[Array, ...], there: list[Array]) -> tuple[Array, ...]:
+        """Add a step to each ray that took one, where steps are counted."""
+        return tuple(step + moved for step, moved in zip(steps, there, strict=True)) if steps else ()
+
+
+def _walk_group(
+    scene: WideScene, group: tuple[Array, Array], stacks: tuple[Array, ...], options: WalkOptions
+) -> tuple[tuple[Array, ...], _Walked]:
+    """Walk `options.interleave` rays side by side."""
+    lanes = jnp.arange(WIDTH, dtype=jnp.int32)
+    rays = tuple(
+        _Ray(floats, ints, jnp.int32(1) << (lanes ^ ints[3])) for floats, ints in zip(*group, strict=True)
     )
-    results = [_result(scene, *each, options) for each in zip(rays, places, bests, strict=True)]
-    t, face, u, v = (jnp.stack([r[k] for r in results]) for k in range(4))
-    nothing = jnp.zeros((count, 0))
-    if options.any_hit:
-        return Traced(nothing, face, nothing, nothing, nothing)
-    return Traced(t, face, u, v, jnp.stack(steps) if steps else nothing)
+    walk = _Walk(scene, rays, options)
+    zero = jnp.int32(0)
+    places = tuple(_Place(jnp.where(ray.valid, zero, DONE), zero, zero, jnp.int32(1)) for ray in rays)
+    bests = tuple(
+        _Best(ray.t_max * SLACK, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
+    )
+    steps = (zero,) * len(rays) if options.count_steps else ()
+
+    def nodes_then_leaves(carried: tuple[_State, tuple[_Best, ...]]) -> tuple[_State, tuple[_Best, ...]]:
+        state, bests = carried
+        state = lax.while_loop(
+            lambda s: walk.goes_on(s, lambda place: place.child >= 0),
+            lambda s: walk.visit_nodes(s, bests),
+            state,
+        )
+        return walk.visit_leaves(state, bests)
+
+    state, bests = lax.while_loop(
+        lambda carried: walk.goes_on(carried[0], lambda place: place.child != DONE),
+        nodes_then_leaves,
+        (_State(places, stacks, zero, steps), bests),
+    )
+    results = [_result(*each) for each in zip(rays, state.places, bests, strict=True)]
+    t, face = (jnp.stack([r[k] for r in results]) for k in range(2))
+    return state.stacks, _Walked(t, face, jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0)))
 
 
-def _result(
-    scene: WideScene, ray: _Ray, place: _Place, best: _Best, options: WalkOptions
-) -> tuple[Array, Array, Array, Array]:
-    """What is reported of a ray: t in the caller's units, face, u and v."""
+def _result(ray: _Ray, place: _Place, best: _Best) -> tuple[Array, Array]:
+    """What is reported of a ray: t in the caller's units, and the face."""
     t, face = _closest_lane(best)
-    u, v = (jnp.float32(0), jnp.float32(0)) if options.any_hit else _weights(scene, ray, face)
     t = jnp.where(face < 0, jnp.float32(jnp.inf), t * ray.t_unit)
-    return t, jnp.where(place.child != DONE, STUCK, face), u, v
+    return t, jnp.where(place.child != DONE, STUCK, face)
