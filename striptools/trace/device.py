@@ -15,7 +15,7 @@ from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from striptools.errors import MissingExtraError, UsageError
 
@@ -128,9 +128,10 @@ def prepare_jax(environ: MutableMapping[str, str] = os.environ) -> None:
         raise MissingExtraError(
             "tracing needs JAX, which is not installed", remedy='pip install "striptools[trace]"'
         ) from error
-    if jax.config.read("jax_compilation_cache_dir") is None and (folder := cache_folder(environ)) is not None:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir is None and (folder := cache_folder(environ)) is not None:
+        config.update("jax_compilation_cache_dir", str(folder))
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if not set_cpu_devices(cores, environ) and not hoisted_before:
         warnings.warn(
             "JAX was running before striptools.trace was imported, so that tracing on the CPU is many times "
@@ -144,11 +145,12 @@ def set_cpu_devices(count: int, environ: MutableMapping[str, str]) -> bool:
     """Ask JAX for that many CPU devices, unless the user did; say whether its backend was still down."""
     import jax
 
-    wanted = jax.config.read("jax_num_cpu_devices")
+    config: Any = jax.config
+    wanted = config.jax_num_cpu_devices
     if wanted < 0 and "--xla_force_host_platform_device_count" not in environ.get("XLA_FLAGS", ""):
         wanted = count
     try:
-        jax.config.update("jax_num_cpu_devices", wanted)
+        config.update("jax_num_cpu_devices", wanted)
     except RuntimeError:
         return False
     return True
