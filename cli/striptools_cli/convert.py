@@ -1,0 +1,234 @@
+"""`striptools convert`: a mesh into a scene, or a scene back into a mesh."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Annotated
+
+import typer
+
+from striptools.errors import UsageError
+from striptools.mesh.clean import CleanOptions
+from striptools.mesh.io import WRITE_FORMATS, save_mesh
+from striptools.pipeline import Options, Report, convert_with_report
+from striptools.reducem.reader import read_scene
+from striptools.reducem.scene import Scene
+from striptools.stopwatch import Stopwatch
+from striptools.strips.ordering import OrderingOptions
+from striptools_cli import log, notice
+from striptools_cli.progress import StageProgress
+from striptools_cli.report import human_bytes, human_value, render
+from striptools_cli.streams import (
+    SCENE_FORMAT,
+    STANDARD,
+    Source,
+    Target,
+    input_format,
+    output_format,
+    refuse_same,
+    say,
+)
+
+_CLEAN = CleanOptions()
+_ORDER = OrderingOptions()
+
+_SAID_OF_COUNTS = {
+    "non_finite": "dropped {} with a non-finite vertex|face|faces",
+    "repeated_vertex": "dropped {} with a repeated vertex|face|faces",
+    "zero_area": "dropped {} of zero area|face|faces",
+    "duplicate_faces_dropped": "dropped {}|duplicate face|duplicate faces",
+    "duplicate_faces_kept": "kept {} (--drop-duplicates drops them)|duplicate face|duplicate faces",
+    "vertices_welded": "welded {}|vertex|vertices",
+    "vertices_unreferenced": "left out {} that no face uses|vertex|vertices",
+}
+
+
+def run(
+    source: Annotated[str, typer.Argument(metavar="IN", help="Mesh or scene; - for standard input.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Scene or mesh; - for standard output.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace OUT where it exists.")] = False,
+    report: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.json", help="Write seconds by stage, peak memory, counts; - prints them."),
+    ] = None,
+    no_remap: Annotated[
+        bool, typer.Option("--no-remap", help="Leave out which source face each triangle was.")
+    ] = False,
+    weld: Annotated[
+        float,
+        typer.Option(min=0.0, metavar="DIST", help="Merge vertices up to this far apart; 0: equal ones."),
+    ] = _CLEAN.weld,
+    drop_duplicates: Annotated[
+        bool, typer.Option("--drop-duplicates", help="Keep one of several faces with the same corners.")
+    ] = _CLEAN.drop_duplicates,
+    max_length: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Most triangles in a strip.")
+    ] = _ORDER.max_length,
+    distance_weight: Annotated[
+        float, typer.Option(min=0.0, metavar="W", help="Weight of nearness in the SAH tree when strips join.")
+    ] = _ORDER.distance_weight,
+    balance_weight: Annotated[
+        float, typer.Option(min=0.0, metavar="W", help="Weight of equal lengths when strips join.")
+    ] = _ORDER.balance_weight,
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
+    ] = None,
+    from_format: Annotated[
+        str | None,
+        typer.Option("--from", metavar="FORMAT", help="Format of IN.", show_default="extension"),
+    ] = None,
+    to_format: Annotated[
+        str | None,
+        typer.Option("--to", metavar="FORMAT", help="Format of OUT.", show_default="extension"),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Add seconds by stage, bytes by part.")
+    ] = False,
+) -> None:
+    """Turn a mesh into a scene file (.rdm), or a scene file back into a mesh.
+
+    The direction follows from the formats of IN and OUT. Whatever cleaning drops or changes is counted and
+    said. Back from a scene, every face that cleaning kept comes out with its winding, in the source's order
+    and from the source's first corner unless the scene was made with --no-remap.
+    """
+    log.set_up(quiet=quiet, verbose=verbose)
+    options = Options(
+        clean=CleanOptions(weld=weld, drop_duplicates=drop_duplicates),
+        ordering=OrderingOptions(max_length, distance_weight, balance_weight),
+        remap=not no_remap,
+        threads=threads,
+    )
+    write_format = output_format(target, to_format, (SCENE_FORMAT, *WRITE_FORMATS))
+    _check_names(source, target, report)
+    out = Target.open(target, force=force)
+    file = Source.open(source)
+    read_format = input_format(file, from_format)
+    _check_direction(read_format, write_format, options)
+    job = _to_mesh if read_format == SCENE_FORMAT else _to_scene
+    outcome = job(file, out, options, (read_format, write_format), quiet)
+    if report:
+        Target.open(report, force=True).write(lambda file: _write_text(file, render(outcome.facts, "json")))
+    if not quiet:
+        lines = [*outcome.lines, *(outcome.details if verbose else ())]
+        say("".join(f"{line}\n" for line in lines), error=STANDARD in (target, report))
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    lines: list[str]
+    details: list[str]
+    facts: dict[str, object]
+
+
+def _check_direction(read_format: str, write_format: str, options: Options) -> None:
+    from_scene, to_scene = read_format == SCENE_FORMAT, write_format == SCENE_FORMAT
+    if from_scene == to_scene:
+        raise UsageError(
+            "IN and OUT are both scenes" if from_scene else "neither IN nor OUT is a scene",
+            remedy=f"one of them must be .{SCENE_FORMAT}, by its name or by --from or --to",
+        )
+    if from_scene and dataclasses.replace(options, threads=None) != Options():
+        raise UsageError("an option that shapes a scene, but IN is a scene already", remedy="leave it out")
+
+
+def _check_names(source: str, target: str, report: str | None) -> None:
+    refuse_same(source, target)
+    if report:
+        refuse_same(source, report)
+        refuse_same(target, report)
+        if report == target == STANDARD:
+            raise UsageError("--report and OUT cannot both be standard output", remedy="name a file for one")
+
+
+def _to_scene(
+    source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
+) -> _Outcome:
+    notice.before_kernels(quiet=quiet)
+    clock = Stopwatch()
+    with StageProgress(quiet=quiet) as progress:
+        scene, report = convert_with_report(
+            source.file, options, file_format=formats[0] or None, watch=progress.watch
+        )
+        progress.watch("write", 0.0)
+        with clock.stage("write"):
+            target.write(scene.save)
+    written, peak = clock.read()
+    total = report.seconds["total"] + written["write"]
+    seconds = _ordered({**report.seconds, "write": written["write"], "total": total})
+    lines = [f"{_arrow(source, target)}, {_density(scene)}", *_changes(report)]
+    facts = {
+        "seconds": seconds,
+        "peak_bytes": max(peak, report.peak_bytes),
+        "counts": {**report.counts, "triangles": scene.triangle_count, "vertices": scene.vertex_count},
+        "largest_rounding": report.largest_rounding,
+        "weld_error": report.weld_error,
+        "notes": list(report.notes),
+    }
+    return _Outcome(lines, list(_details(seconds, scene)), facts)
+
+
+def _to_mesh(
+    source: Source, target: Target, _options: Options, formats: tuple[str, str], quiet: bool
+) -> _Outcome:
+    notice.before_kernels(quiet=quiet)
+    with StageProgress(quiet=quiet) as progress:
+        clock = Stopwatch(progress.watch)
+        with clock.stage("load"):
+            scene = read_scene(source.file)
+        with clock.stage("decode"):
+            mesh = scene.to_mesh()
+        with clock.stage("write"):
+            target.write(lambda file: save_mesh(mesh, file, file_format=formats[1]))
+    seconds, peak = clock.read()
+    order = "in the source's order" if scene.remap else "in file order, for the scene has no remap"
+    line = f"{_arrow(source, target)}, {mesh.triangle_count:,} triangles {order}"
+    counts = {"triangles": mesh.triangle_count, "vertices": mesh.vertex_count, "strips": scene.strip_count}
+    facts = {"seconds": seconds, "peak_bytes": peak, "counts": counts}
+    return _Outcome([line], list(_details(seconds, scene)), facts)
+
+
+def _arrow(source: Source, target: Target) -> str:
+    return f"{source.title} ({human_bytes(source.size)}) -> {target.title} ({human_bytes(target.size)})"
+
+
+def _density(scene: Scene) -> str:
+    return (
+        f"{scene.triangle_count:,} triangles, "
+        f"{len(scene.vertices) / scene.triangle_count:.2f} vertices per triangle, "
+        f"{scene.bytes_per_triangle():.1f} bytes per triangle"
+    )
+
+
+def _changes(report: Report) -> Iterator[str]:
+    for note in report.notes:
+        yield f"  loaded: {note}"
+    for key, pattern in _SAID_OF_COUNTS.items():
+        count = report.counts.get(key, 0)
+        if count:
+            sentence, one, many = pattern.split("|")
+            yield f"  cleaned: {sentence.format(f'{count:,} {one if count == 1 else many}')}"
+    if report.largest_rounding > 0.0:
+        yield f"  cleaned: rounded to float32, by at most {human_value(report.largest_rounding)}"
+    if report.weld_error > 0.0:
+        yield f"  cleaned: welding moved vertices, by at most {human_value(report.weld_error)}"
+
+
+def _details(seconds: dict[str, float], scene: Scene) -> Iterator[str]:
+    for stage, duration in seconds.items():
+        yield f"  {stage:<16}{duration:12.3f} s"
+    for part, size in scene.part_bytes().items():
+        share = size / scene.triangle_count
+        yield f"  {part.replace('_', ' '):<16}{size:12,} bytes  {share:8.3f} per triangle"
+
+
+def _ordered(seconds: dict[str, float]) -> dict[str, float]:
+    return {**{stage: time for stage, time in seconds.items() if stage != "total"}, "total": seconds["total"]}
+
+
+def _write_text(file: Path | IO[bytes], text: str) -> None:
+    if isinstance(file, Path):
+        file.write_text(text, encoding="utf-8")
+    else:
+        file.write(text.encode())

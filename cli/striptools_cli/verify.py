@@ -1,0 +1,115 @@
+"""`striptools verify`: trace a scene file and prove it against its source mesh."""
+
+from typing import Annotated
+
+import typer
+
+from striptools.errors import EXIT_DONE, EXIT_ISSUES, UsageError
+from striptools.measure.judgement import SetResult
+from striptools.measure.verify import VerifyOptions, VerifyReport, verify
+from striptools.mesh.io import load_mesh
+from striptools.reducem.reader import read_scene
+from striptools.trace import Tracer
+from striptools.trace.device import DeviceKind
+from striptools_cli import log, notice
+from striptools_cli.progress import StageProgress
+from striptools_cli.report import Format, human_value, render
+from striptools_cli.streams import Source, input_format, say
+
+_DEFAULTS = VerifyOptions()
+
+
+def run(
+    scene: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
+    against: Annotated[
+        str, typer.Option(metavar="MESH", help="The mesh it was made from; - for standard input.")
+    ],
+    rays: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Rays of each kind to try against every face.")
+    ] = _DEFAULTS.rays,
+    aimed_rays: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Rays to aim exactly at edges and vertices.")
+    ] = _DEFAULTS.aimed_rays,
+    pair_budget: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", help="Most pairs of a ray and a face; caps --rays on large models."),
+    ] = _DEFAULTS.pair_budget,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the random rays.")] = _DEFAULTS.seed,
+    device: Annotated[
+        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
+    ] = "auto",
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads to trace with.", show_default="every core")
+    ] = None,
+    from_format: Annotated[
+        str | None, typer.Option("--from", metavar="FORMAT", help="Format of MESH.", show_default="extension")
+    ] = None,
+    form: Annotated[Format, typer.Option("--format", help="How to print the report.")] = "text",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+) -> None:
+    """Trace a scene file with JAX and prove it against the mesh it was made from.
+
+    The faces are compared one by one. Camera rays, secondary rays and rays aimed exactly at edges and
+    vertices are traced and judged by a float64 oracle over the source. Any disagreement or leak ends in exit
+    code 1.
+    """
+    log.set_up(quiet=quiet)
+    options = VerifyOptions(rays=rays, aimed_rays=aimed_rays, pair_budget=pair_budget, seed=seed)
+    if scene == against:
+        raise UsageError(
+            "the scene and the mesh are one file", where=scene, remedy="name the mesh after --against"
+        )
+    scene_file, mesh_file = Source.open(scene), Source.open(against)
+    with StageProgress(quiet=quiet) as progress:
+        progress.watch("load", 0.0)
+        loaded = read_scene(scene_file.file)
+        source = load_mesh(mesh_file.file, file_format=input_format(mesh_file, from_format) or None)
+        notice.before_tracing(quiet=quiet)
+        tracer = Tracer(loaded, device=device, threads=threads)
+        report = verify(loaded, source, options, tracer=tracer, watch=progress.watch)
+    if not quiet:
+        facts = in_lines(report) if form == "text" else describe(report)
+        say(render(facts, form, f"{scene_file.title} against {mesh_file.title}: {summary(report)}"))
+    raise typer.Exit(EXIT_DONE if report.ok else EXIT_ISSUES)
+
+
+def summary(report: VerifyReport) -> str:
+    """The verdict in one line."""
+    faults = f"{report.disagreements:,} disagreements, {report.leaks:,} leaks"
+    faces = f", {report.structure.errors:,} wrong faces" if report.structure.errors else ""
+    verdict = "proved" if report.ok else "NOT proved"
+    return f"{verdict}, {human_value(report.rays)} rays, {faults}{faces}"
+
+
+def describe(report: VerifyReport) -> dict[str, object]:
+    """The whole report as a record, with a group for each kind of rays."""
+    facts = report.to_dict()
+    facts["sets"] = {part.pop("name"): part for part in facts["sets"]}
+    return facts
+
+
+def in_lines(report: VerifyReport) -> dict[str, object]:
+    """What a person wants to know of the report: a line for each kind of rays, then the flaws."""
+    facts: dict[str, object] = {part.name: _line(part) for part in report.sets}
+    structure = report.structure
+    facts["faces"] = (
+        f"{structure.present:,} of {structure.expected:,} expected; {structure.missing:,} missing, "
+        f"{structure.unexpected:,} unexpected, {structure.wrong:,} wrong, {structure.excused:,} excused"
+    )
+    facts["surface"] = (
+        "closed" if report.closed else f"open, nothing is certain at {report.open_edges:,} edges"
+    )
+    facts["largest t error"] = f"{report.max_t_error:.4g}, {report.max_t_ratio:.2f} of its bound"
+    if report.rays_tried < report.rays_wanted:
+        facts["sampled"] = (
+            f"{report.rays_tried:,} of {report.rays_wanted:,} rays of each kind were tried against every "
+            "face, for the model is large (--pair-budget)"
+        )
+    return {**facts, **{f"flaw {number}": flaw for number, flaw in enumerate(report.flaws, 1)}}
+
+
+def _line(part: SetResult) -> str:
+    return (
+        f"{part.rays:>9,} rays, {part.hits:>9,} hit, {part.uncertain:>7,} uncertain, "
+        f"{part.disagreements:,} disagreements, {part.leaks:,} leaks"
+    )

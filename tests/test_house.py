@@ -1,0 +1,112 @@
+"""The house is in order: lint, types, import contracts, a light import, nothing of one machine."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+TOOLS = Path(sys.executable).parent
+IMPORT_LIMIT = 0.5
+HEAVY = ("jax", "jaxlib", "numba", "llvmlite", "trimesh", "scipy", "networkx")
+FOREIGN = re.compile(
+    r"(?<![\w.])/(home|root|Users|work|tmp|var|mnt|media)/[\w.]"  # a place on one machine
+    r"|[A-Z]:\\\\?Users"
+    r"|\b(pypi\.org|pythonhosted\.org|npmjs\.(com|org)|crates\.io)\b"  # a package registry
+)
+
+
+def run_tool(name: str, *arguments: str) -> None:
+    tool = shutil.which(name, path=str(TOOLS)) or shutil.which(name)
+    if tool is None:
+        pytest.fail(f"{name} is not installed: install the extra dev")
+    done = subprocess.run(
+        [tool, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def tracked_files() -> list[Path]:
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    listed = subprocess.run(
+        [git, "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    return [ROOT / name for name in listed.split("\0") if name and (ROOT / name).is_file()]
+
+
+def test_lint() -> None:
+    run_tool("ruff", "check", ".")
+
+
+def test_formatting() -> None:
+    run_tool("ruff", "format", "--check", ".")
+
+
+def test_types() -> None:
+    run_tool("basedpyright", "--pythonpath", sys.executable)
+
+
+def test_import_contracts() -> None:
+    run_tool("lint-imports")
+
+
+def test_import_is_fast_and_light() -> None:
+    script = (
+        "import json, sys, time; start = time.perf_counter(); import striptools; "
+        "seconds = time.perf_counter() - start; print(json.dumps([seconds, sorted(sys.modules)]))"
+    )
+    runs = []
+    for _ in range(3):
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        runs.append(json.loads(done.stdout))
+    assert not {module for _, modules in runs for module in modules} & set(HEAVY)
+    # A busy machine only ever adds time, so the best of the runs is the measure.
+    assert min(seconds for seconds, _ in runs) < IMPORT_LIMIT
+
+
+def test_conversion_needs_no_jax() -> None:
+    script = "import sys, striptools; striptools.convert; striptools.open; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_public_names_exist() -> None:
+    import striptools
+
+    assert all(hasattr(striptools, name) for name in striptools.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = striptools.nothing
+
+
+def test_nothing_of_one_machine_is_tracked() -> None:
+    found = []
+    for path in tracked_files():
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            continue
+        if path != Path(__file__):
+            found += [f"{path.relative_to(ROOT)}: {match[0]}" for match in FOREIGN.finditer(text)]
+    assert not found
+
+
+@pytest.mark.parametrize("line", ["see /home/anna/x.ply", "= '/tmp/out'", "https://pypi.org/simple"])
+def test_the_search_for_machine_paths_finds_them(line: str) -> None:
+    assert FOREIGN.search(line)
+
+
+def test_ci_runs_the_commands_of_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text()
+    commands = [line.strip() for line in readme.splitlines() if line.strip().startswith("python3.11 -m venv")]
+    assert len(commands) == 2, "the README has two commands for a fresh machine"
+    assert commands[0].endswith("samples/first_scene.py")
+    ci = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert "set -euo pipefail" in ci
+    assert ci[-1] == commands[1]
+    assert commands[1] in (ROOT / "CONTRIBUTING.md").read_text()
+    assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
