@@ -25,7 +25,7 @@ def meshes_folder() -> Path | None:
 
 @pytest.fixture(scope="session")
 def real_mesh() -> Callable[[str], Path]:
-    """`real_mesh("bunny.ply")` is the path of a real model ("bunny" will do); the test is skipped without it."""
+    """`real_mesh("bunny")` or `real_mesh("scenes/x.glb")` is a real model's path, or skips the test."""
 
     def find(name: str) -> Path:
         folder = meshes_folder()

@@ -1,8 +1,9 @@
 """Hypothesis strategies for meshes, drawn from where bugs live.
 
 `meshes()` draws anything a file may hold: NaN, repeated vertices, zero area, duplicates, unused vertices.
-`clean_meshes()` draws what `striptools.mesh.clean` hands on; `mesh_of_kind(name)` draws one kind of the list `KINDS`.
-All are small (`MOST_TRIANGLES`), and every shape comes with flipped, repeated and shuffled faces and moved far away.
+`clean_meshes()` draws what `striptools.mesh.clean` hands on; `mesh_of_kind(name)` draws one kind of the list
+`KINDS`. All are small (`MOST_TRIANGLES`), and every shape comes with flipped, repeated and shuffled faces and
+moved far away.
 """
 
 import numpy as np
@@ -86,7 +87,7 @@ def sphere(divisions: int) -> Arrays:
 
 
 def soup(triangles: int, seed: int, lattice: int) -> Arrays:
-    """Triangles that share no vertex, on a small lattice: coincident, overlapping and degenerate by chance."""
+    """Triangles that share no vertex, on a small lattice: coincident and degenerate by chance."""
     random = np.random.default_rng(seed)
     positions = random.integers(-lattice, lattice + 1, (3 * triangles, 3)).astype(np.float32)
     return positions, np.arange(3 * triangles, dtype=np.int32).reshape(-1, 3)
@@ -154,7 +155,7 @@ def meshes(draw: st.DrawFn, *, hostile: bool = True) -> Mesh:
 
 @st.composite
 def clean_meshes(draw: st.DrawFn) -> Mesh:
-    """A mesh as cleaning hands it on: float32, welded, every vertex used, no face of zero area, at least one face."""
+    """A mesh as cleaning hands it on: welded float32, every vertex used, no zero area, at least one face."""
     options = CleanOptions(drop_duplicates=draw(st.booleans()))
     cleaned = clean(draw(meshes(hostile=draw(st.booleans()))), options).mesh
     assume(cleaned.triangle_count > 0)

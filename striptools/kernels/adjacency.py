@@ -1,4 +1,4 @@
-"""Half-edge rings by two counting sorts: linear whatever the mesh, fans and edges of 100,000 faces included."""
+"""Half-edge rings by two counting sorts: linear whatever the mesh, fans of 100,000 faces included."""
 
 import numpy as np
 from numba import njit
@@ -72,7 +72,7 @@ def interleave_windings(faces, order, begin, end, row):
 
 @njit(cache=True, nogil=True)
 def close_rings(row, count, ring):
-    """Cut `row[:count]` into rings of at most `LONGEST_RING` (the last takes a lone rest in) and close them."""
+    """Cut `row[:count]` into rings of at most `LONGEST_RING` (the last takes in a lone rest), closed."""
     begin = 0
     while begin < count:
         end = min(begin + LONGEST_RING, count)

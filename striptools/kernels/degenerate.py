@@ -12,8 +12,8 @@ DOUBTFUL = 3
 CROSS_ERROR = 8.0 * 2.0**-53
 """Each component of the cross product below is computed within this times the sum of its two products' sizes.
 
-Two rounded differences, two rounded products and one rounded subtraction make (1 + u)^4 - 1 < 4.01 u of that sum,
-u = 2^-53; the rest is reserve. Nothing under- or overflows: the products of float32 differences lie
+Two rounded differences, two rounded products and one rounded subtraction make (1 + u)^4 - 1 < 4.01 u of that
+sum, u = 2^-53; the rest is reserve. Nothing under- or overflows: the products of float32 differences lie
 between 2^-298 and 2^258.
 """
 

@@ -26,7 +26,8 @@ def walk_bytes(stream, place, rows, layout, big_endian, target, starts, lengths)
         stream: Bytes.
         place: Where the first row begins.
         rows: How many rows there should be.
-        layout: `(columns, 3)` int64: bytes of an entry; bytes of a list's length, 0 for no list; whether it is signed.
+        layout: `(columns, 3)` int64: bytes of an entry; bytes of a list's length, 0 for no list; whether it
+            is signed.
         big_endian: The byte order of the lengths.
         target: The column asked for, or -1.
         starts: `(rows,)` int64 to fill, where `target >= 0`.

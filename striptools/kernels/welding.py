@@ -3,15 +3,25 @@
 import numpy as np
 from numba import njit
 
+LOW_WORD = np.uint64(0xFFFFFFFF)
+
+
+@njit(cache=True, nogil=True)
+def scramble(word):
+    """A 32-bit permutation that spreads every bit (Wellons 2018, "Prospecting for hash functions").
+
+    Kept in 64 bits, where a product of two 32-bit numbers does not overflow, so that it runs without Numba
+    too.
+    """
+    word = ((word ^ (word >> np.uint64(16))) * np.uint64(0x7FEB352D)) & LOW_WORD
+    word = ((word ^ (word >> np.uint64(15))) * np.uint64(0x846CA68B)) & LOW_WORD
+    return word ^ (word >> np.uint64(16))
+
 
 @njit(cache=True, nogil=True)
 def mix_bits(a, b, c):
-    """A 64-bit hash of three words (multiply and shift, constants of SplitMix64)."""
-    h = np.uint64(a) | (np.uint64(b) << np.uint64(32))
-    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    h = h ^ (np.uint64(c) * np.uint64(0x9E3779B97F4A7C15))
-    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
+    """A 32-bit hash of three 32-bit words."""
+    return scramble(np.uint64(c) ^ scramble(np.uint64(b) ^ scramble(np.uint64(a))))
 
 
 @njit(cache=True, nogil=True)
@@ -58,8 +68,8 @@ def nearest_leaders(points, distance):
         distance: The greatest displacement, positive and finite, in the unit of the points.
 
     Returns:
-        The leader of each point, `(n,)` int32 (a leader leads itself; so does a point that is not finite), and
-        the greatest distance from a point to its leader.
+        The leader of each point, `(n,)` int32 (a leader leads itself; so does a point that is not finite),
+        and the greatest distance from a point to its leader.
     """
     count = points.shape[0]
     slots = 16

@@ -1,1 +1,1 @@
-
+"""The mesh: loading, cleaning, adjacency, saving."""

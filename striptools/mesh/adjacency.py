@@ -8,13 +8,13 @@ The policy for edges that are not shared by exactly two faces:
 
 1. A half-edge that is alone on its edge (a border) is its own ring.
 2. All half-edges of an edge are listed with forward ones (from the smaller vertex index to the larger) and
-   backward ones in turn, each kind by ascending half-edge, starting with a forward one; when one kind runs out
-   the rest of the other follows. So faces that agree in winding come to lie beside each other.
+   backward ones in turn, each kind by ascending half-edge, starting with a forward one; when one kind runs
+   out the rest of the other follows. So faces that agree in winding come to lie beside each other.
 3. That list is cut into rings of at most four; a lone rest joins the ring before it, which then has five. So
-   no search round an edge costs more than a constant, whatever the edge has, and a half-edge stands alone only
-   on a border.
-4. Two faces of one edge are neighbours whatever their windings; `same winding` is a question for the reader of
-   the ring.
+   no search round an edge costs more than a constant, whatever the edge has, and a half-edge stands alone
+   only on a border.
+4. Two faces of one edge are neighbours whatever their windings; `same winding` is a question for the reader
+   of the ring.
 5. An edge from a vertex to itself has no neighbours.
 
 Two counting sorts over the half-edges find the edges: linear time, no hashing, ties by index.
@@ -35,6 +35,9 @@ from striptools.types import Faces
 if TYPE_CHECKING:
     import networkx
 
+HalfEdges = Int32[np.ndarray, " h"]
+"""One value per half-edge: `h` is three times the number of faces."""
+
 LONGEST_RING = 5
 """The most half-edges on one ring."""
 
@@ -44,10 +47,11 @@ class Adjacency:
     """Which faces meet at which edge.
 
     Args:
-        ring: `(3n,)` int32: `ring[h]` is the next half-edge on the ring of `h`, cyclic; `ring[h] == h` on a border.
+        ring: `(3n,)` int32: `ring[h]` is the next half-edge on the ring of `h`, cyclic; `ring[h] == h` on a
+            border.
     """
 
-    ring: Int32[np.ndarray, " h"]
+    ring: HalfEdges
 
 
 def build_adjacency(faces: Faces, vertex_count: int) -> Adjacency:
@@ -97,12 +101,12 @@ def check_adjacency(adjacency: Adjacency, faces: Faces) -> None:
 def dual_graph(adjacency: Adjacency, faces: Faces) -> networkx.Graph:
     """The dual graph: a node for every face, an edge between any two faces that share a ring.
 
-    Attributes of an edge `(f, g)`: `shared`, a tuple of the vertex pairs `(a, b)`, a < b, across which they are
-    neighbours, ascending; and `same_winding`, true where they run every one of these in opposite directions, as
-    two faces of a consistently oriented surface do. Faces that share two or three edges (duplicates, flaps)
-    have ONE edge here with several pairs in `shared`: this is a simple graph, not a multigraph. A face that
-    meets itself (a row like `a b a`) gets no loop. Faces of one mesh edge that lie on different rings, which
-    takes six or more faces there, are no neighbours.
+    Attributes of an edge `(f, g)`: `shared`, a tuple of the vertex pairs `(a, b)`, a < b, across which they
+    are neighbours, ascending; and `same_winding`, true where they run every one of these in opposite
+    directions, as two faces of a consistently oriented surface do. Faces that share two or three edges
+    (duplicates, flaps) have ONE edge here with several pairs in `shared`: this is a simple graph, not a
+    multigraph. A face that meets itself (a row like `a b a`) gets no loop. Faces of one mesh edge that lie on
+    different rings, which takes six or more faces there, are no neighbours.
     """
     import networkx
 
@@ -146,7 +150,7 @@ def _ring_labels(ring: np.ndarray) -> np.ndarray:
 
 
 def _check_cuts(label: np.ndarray, edge: np.ndarray, *, forward: np.ndarray, loop: np.ndarray) -> None:
-    """Raise unless each edge has the fewest rings of four and no pair of opposite half-edges is torn apart."""
+    """Raise unless each edge has the fewest rings and no pair of opposite half-edges is torn apart."""
     edges = int(edge.max()) + 1 if len(edge) else 0
     size = np.bincount(edge, minlength=edges)
     rings = np.bincount(edge[label == np.arange(len(label))], minlength=edges)

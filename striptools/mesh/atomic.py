@@ -19,8 +19,9 @@ def write_atomically(path: str | Path, content: Content) -> int:
     """Write `content` to a new file beside `path`, then put it in place in one step.
 
     Until the last step `path` is untouched, and after a failure of any kind (a full disk, an interrupt, an
-    exception of the writing function) nothing new is left in the folder. A symbolic link is followed; a device or
-    a pipe is written to directly. Safe against the end of the program, not of the machine: nothing is synced.
+    exception of the writing function) nothing new is left in the folder. A symbolic link is followed; a
+    device or a pipe is written to directly. Safe against the end of the program, not of the machine: nothing
+    is synced.
 
     Args:
         path: The file to create or replace.

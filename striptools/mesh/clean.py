@@ -1,22 +1,24 @@
-"""Make a loaded mesh fit for the stages after it: float32, welded, every face of positive area, every loss counted.
+"""Make a loaded mesh fit for what follows: float32, welded, every face of positive area, every loss counted.
 
 The order of the work, which decides what a face is counted under:
 
-1. Positions are rounded to float32 (to nearest); the largest rounding is reported. A value beyond float32's range
-   becomes infinite.
+1. Positions are rounded to float32 (to nearest); the largest rounding is reported. A value beyond float32's
+   range becomes infinite.
 2. Vertices are welded. By default those whose three words are equal BIT FOR BIT: so -0.0 and +0.0 stay apart,
-   because positions have to come back bit-exact, and a seam of mixed zeros stays a seam. With a tolerance each
-   vertex, by ascending index, moves to the nearest vertex before it that was not itself moved and lies within the
-   tolerance. So welding is not transitive (a chain of close vertices does not collapse into one), no vertex moves
-   farther than the tolerance, and the first vertex of a cluster keeps its position; -0.0 and +0.0 are then one.
-3. Faces are dropped, each counted under the first reason that holds: `non_finite`, a corner is NaN or infinite;
-   `repeated_vertex`, two corners are one vertex; `zero_area`, the float32 corners lie on one line exactly;
-   `duplicate_faces_dropped`, only where asked, an earlier face has the same vertices in the same winding.
-4. Vertices that no kept face uses are dropped. What is left keeps its order, faces and vertices alike, and each
-   face its first corner.
+   because positions have to come back bit-exact, and a seam of mixed zeros stays a seam. With a tolerance
+   each vertex, by ascending index, moves to the nearest vertex before it that was not itself moved and lies
+   within the tolerance. So welding is not transitive (a chain of close vertices does not collapse into one),
+   no vertex moves farther than the tolerance, and the first vertex of a cluster keeps its position; -0.0 and
+   +0.0 are then one.
+3. Faces are dropped, each counted under the first reason that holds: `non_finite`, a corner is NaN or
+   infinite; `repeated_vertex`, two corners are one vertex; `zero_area`, the float32 corners lie on one line
+   exactly; `duplicate_faces_dropped`, only where asked, an earlier face has the same vertices in the same
+   winding.
+4. Vertices that no kept face uses are dropped. What is left keeps its order, faces and vertices alike, and
+   each face its first corner.
 
-Zero area is decided exactly: float64 with an error bound first (kernels/degenerate.py); then, for the doubtful
-faces, float64 once more where every difference and product is exact in it; then integers.
+Zero area is decided exactly: float64 with an error bound first (kernels/degenerate.py); then, for the
+doubtful faces, float64 once more where every difference and product is exact in it; then integers.
 """
 
 from __future__ import annotations
@@ -39,9 +41,10 @@ class CleanOptions:
     """What cleaning may change.
 
     Args:
-        weld: The farthest a vertex may move to be welded to another, in the model's unit; 0 welds only vertices
-            that are equal bit for bit.
-        drop_duplicates: Whether a face with the same vertices in the same winding as an earlier one is dropped.
+        weld: The farthest a vertex may move to be welded to another, in the model's unit; 0 welds only
+            vertices that are equal bit for bit.
+        drop_duplicates: Whether a face with the same vertices in the same winding as an earlier one is
+            dropped.
 
     Raises:
         UsageError: Where `weld` is negative or not finite.
@@ -63,14 +66,16 @@ class Cleaned:
 
     Args:
         mesh: float32 positions, all finite, each used; no face with a repeated vertex or zero area.
-        source_face: `(n,)` int32, ascending: the face of the loaded mesh that each face is. Its corners are the
-            source's in the source's order.
-        counts: `faces_in == faces_out + non_finite + repeated_vertex + zero_area + duplicate_faces_dropped` and
-            `vertices_in == vertices_out + vertices_welded + vertices_unreferenced`; `duplicate_faces_kept` are
-            the faces among `faces_out` that repeat an earlier one in vertices and winding.
-        largest_rounding: The largest change of a coordinate by rounding to float32, in the model's unit; values
-            that overflow are counted as non-finite instead.
-        weld_error: The farthest a vertex was moved by welding, in the model's unit: at most `CleanOptions.weld`.
+        source_face: `(n,)` int32, ascending: the face of the loaded mesh that each face is. Its corners are
+            the source's in the source's order.
+        counts: `faces_in == faces_out + non_finite + repeated_vertex + zero_area + duplicate_faces_dropped`
+            and `vertices_in == vertices_out + vertices_welded + vertices_unreferenced`;
+            `duplicate_faces_kept` are the faces among `faces_out` that repeat an earlier one in vertices and
+            winding.
+        largest_rounding: The largest change of a coordinate by rounding to float32, in the model's unit;
+            values that overflow are counted as non-finite instead.
+        weld_error: The farthest a vertex was moved by welding, in the model's unit: at most
+            `CleanOptions.weld`.
     """
 
     mesh: Mesh
@@ -118,7 +123,7 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS) -> Cleaned:
 
 
 def round_positions(positions: SourcePositions) -> tuple[Positions, float]:
-    """The positions in float32, rounded to nearest, and the largest change of a component that stays finite."""
+    """The positions rounded to float32, and the largest change of a component that stays finite."""
     if positions.dtype == np.float32:
         return positions, 0.0
     largest = 0.0
@@ -181,8 +186,9 @@ def has_zero_area(corners: np.ndarray) -> np.ndarray:
 def _exact_edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges from the first corner, `(n, 2, 3)` float64, and for which rows their products are exact too.
 
-    A product of two numbers that fit float32 is exact in float64. An edge fits float32 where rounding it changes
-    nothing and no bit was lost by the subtraction, which its two-sum remainder tells (Knuth, TAOCP 2, 4.2.2).
+    A product of two numbers that fit float32 is exact in float64. An edge fits float32 where rounding it
+    changes nothing and no bit was lost by the subtraction, which its two-sum remainder tells (Knuth, TAOCP 2,
+    4.2.2).
     """
     start = corners[:, :1].astype(np.float64)
     end = corners[:, 1:].astype(np.float64)
@@ -221,7 +227,7 @@ def _count_reasons(verdict: np.ndarray) -> dict[str, int]:
 
 
 def _drop_repeats(faces: Faces, keep: np.ndarray, *, really: bool) -> int:
-    """Count the kept faces that repeat an earlier kept one up to rotation; take them out of `keep` if `really`."""
+    """Count the kept faces that repeat an earlier one up to rotation; take them out of `keep` if `really`."""
     from striptools.kernels.welding import first_equal_rows
 
     kept = np.flatnonzero(keep)

@@ -1,11 +1,13 @@
 """Read and write mesh files.
 
 Reading goes through trimesh where trimesh can be kept from working over what it reads, one module a format in
-`striptools.mesh.readers`; each says what it has to keep from it. What holds after: every face and vertex of the
-file is there, in the file's order and winding, positions bit for bit; faces that are no triangles are cut or left
-out, and a note says how many. Every header is checked against the bytes that are there before anything is allocated.
+`striptools.mesh.readers`; each says what it has to keep from it. What holds after: every face and vertex of
+the file is there, in the file's order and winding, positions bit for bit; faces that are no triangles are cut
+or left out, and a note says how many. Every header is checked against the bytes that are there before
+anything is allocated.
 
-Writing goes through trimesh too, but for OBJ, of which it writes 8 decimal places where float32 needs 9 digits.
+Writing goes through trimesh too, but for OBJ, of which it writes 8 decimal places where float32 needs 9
+digits.
 """
 
 from __future__ import annotations
@@ -34,12 +36,14 @@ MAGIC = {b"ply": "ply", b"glTF": "glb", b"OFF": "off", b"COFF": "off", b"solid":
 def load_mesh(source: str | Path | IO[bytes], *, file_format: str | None = None) -> Mesh:
     """Read a mesh file.
 
-    Scenes of several meshes or instances are flattened into one mesh with their transforms applied, and a note says
-    so. Positions are float32 where the file holds float32 (or text that float32 holds exactly), else float64.
+    Scenes of several meshes or instances are flattened into one mesh with their transforms applied, and a
+    note says so. Positions are float32 where the file holds float32 (or text that float32 holds exactly),
+    else float64.
 
     Args:
         source: A path, or an open binary file such as `sys.stdin.buffer`.
-        file_format: One of `READ_FORMATS` (or of `MESHLAB_FORMATS`) where the name or the first bytes do not tell.
+        file_format: One of `READ_FORMATS` (or of `MESHLAB_FORMATS`) where the name or the first bytes do not
+            tell.
 
     Raises:
         UnreadableMeshError: Where it cannot be read, is malformed, or holds no triangle.
@@ -72,8 +76,8 @@ def load_mesh(source: str | Path | IO[bytes], *, file_format: str | None = None)
 def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | None = None) -> int:
     """Write a mesh file, whole or not at all: PLY (binary, little endian), OBJ, STL (binary) or GLB.
 
-    Positions are written as float32, bit for bit where they are float32; OBJ holds the digits that bring back the
-    same float32 or float64. STL has no shared vertices.
+    Positions are written as float32, bit for bit where they are float32; OBJ holds the digits that bring back
+    the same float32 or float64. STL has no shared vertices.
 
     Args:
         mesh: What to write.
@@ -176,7 +180,9 @@ def _encode_through_trimesh(mesh: Mesh, name: str) -> bytes:
 
     with np.errstate(all="ignore"):
         positions = mesh.positions.astype(np.float32)
-        return trimesh.Trimesh(positions, mesh.faces, process=False).export(file_type=name)
+        data = trimesh.Trimesh(positions, mesh.faces, process=False).export(file_type=name)
+    assert isinstance(data, bytes)
+    return data
 
 
 def _encode_obj(mesh: Mesh) -> bytes:

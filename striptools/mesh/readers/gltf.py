@@ -1,9 +1,10 @@
 """glTF 2.0 and GLB: the arrays through trimesh, their bounds checked and the scene flattened here.
 
-trimesh gets a tree that holds nothing but the buffers, views and accessors of the triangles' positions and indices,
-each checked against the bytes that are there (Khronos glTF 2.0 specification, sections 3.6 and 3.7.2). Left to
-itself it reads sparse and compressed accessors as zeros, drops the mesh of a node that also has a camera, keeps the
-winding of mirrored instances, and names instances at random, so that their order is not the file's.
+trimesh gets a tree that holds nothing but the buffers, views and accessors of the triangles' positions and
+indices, each checked against the bytes that are there (Khronos glTF 2.0 specification, sections 3.6 and
+3.7.2). Left to itself it reads sparse and compressed accessors as zeros, drops the mesh of a node that also
+has a camera, keeps the winding of mirrored instances, and names instances at random, so that their order is
+not the file's.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from striptools.errors import LimitError, UnreadableMeshError
-from striptools.mesh.mesh import MOST_FACES
+from striptools.mesh.mesh import MOST_FACES, first_face_out_of_range
 from striptools.mesh.readers.parsed import EXPORT_AGAIN, Parsed, counted, file_size, flatten, strict_numbers
 
 DEEPEST_JSON = 64
@@ -209,7 +210,7 @@ def _checked_accessor(
     component = integer(accessor.get("componentType"), f"the component type of {user}", 0)
     if component not in components or accessor.get("type") != shape:
         raise UnreadableMeshError(f"{user} have the wrong type", remedy=EXPORT_AGAIN)
-    count = integer(accessor.get("count"), f"the count of {user}", 0, LONGEST_ARRAY)
+    count = integer(accessor.get("count"), f"the count of {user}", 1, LONGEST_ARRAY)
     offset = integer(accessor.get("byteOffset", 0), f"the offset of {user}", 0)
     view = document.row("bufferViews", accessor["bufferView"], user)
     if any(one in view.get("extensions", {}) for one in COMPRESSIONS):
@@ -217,7 +218,7 @@ def _checked_accessor(
     length = integer(view.get("byteLength"), f"the length of the view of {user}", 0)
     row = int(COMPONENTS[component][1]) * WIDTHS[shape]
     stride = integer(view.get("byteStride", row), f"the stride of {user}", row)
-    if count and offset + (count - 1) * stride + row > length:
+    if offset + (count - 1) * stride + row > length:
         raise UnreadableMeshError(f"{user} reach past the end of their view", remedy=EXPORT_AGAIN)
     buffer = document.row("buffers", view.get("buffer"), user)
     start = integer(view.get("byteOffset", 0), f"the offset of the view of {user}", 0)
@@ -259,9 +260,10 @@ def _through_trimesh(
     for k, (mesh, primitive) in enumerate(wanted):
         positions = _scaled(loaded[str(k)]["vertices"], accessors[primitive["attributes"]["POSITION"]])
         faces = loaded[str(k)]["faces"]
-        if len(faces) and faces.max() >= len(positions):
+        bad = first_face_out_of_range(faces, len(positions))
+        if bad is not None:
             raise UnreadableMeshError(
-                f"meshes[{mesh}] has a face that names vertex {faces.max()} of {len(positions)}",
+                f"face {bad} of meshes[{mesh}] names vertices {faces[bad].tolist()}, of {len(positions)}",
                 remedy=EXPORT_AGAIN,
             )
         parts.setdefault(mesh, []).append(Parsed(positions, faces))
@@ -299,7 +301,7 @@ def _load_uri(document: Document, uri: object, name: str) -> bytes:
     if not isinstance(uri, str):
         raise UnreadableMeshError(f"the uri of {name} is no text", remedy=EXPORT_AGAIN)
     if uri.startswith("data:"):
-        head, comma, body = uri.partition(",")
+        head, _, body = uri.partition(",")
         try:
             return (
                 base64.b64decode(body, validate=True)
@@ -407,7 +409,7 @@ def _find_instances(document: Document) -> list[tuple[int, np.ndarray]]:
 
 
 def _find_roots(document: Document, nodes: list[dict[str, Any]]) -> list[int] | None:
-    """The root nodes of the default scene; without scenes the nodes that are nobody's child; None without nodes."""
+    """The roots of the default scene; without scenes all nodes that are no child; None without nodes."""
     scenes = document.table("scenes")
     if scenes:
         scene = document.row("scenes", document.tree.get("scene", 0), "the file")
@@ -448,7 +450,9 @@ def _local_matrix(node: dict[str, Any], index: int) -> np.ndarray:
 
 
 def _vector(values: object, length: int, name: str) -> np.ndarray:
-    ok = isinstance(values, list) and len(values) == length
-    if not ok or not all(isinstance(one, int | float) and math.isfinite(one) for one in values):
+    numbers = values if isinstance(values, list) else []
+    if len(numbers) != length or not all(
+        isinstance(one, int | float) and math.isfinite(one) for one in numbers
+    ):
         raise UnreadableMeshError(f"{name} is not {length} finite numbers", remedy=EXPORT_AGAIN)
-    return np.array(values, np.float64)
+    return np.array(numbers, np.float64)

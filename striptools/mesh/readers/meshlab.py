@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from striptools.errors import MissingExtraError
 from striptools.mesh.readers.parsed import Parsed, flatten
@@ -56,7 +56,7 @@ def read_through_meshlab(file: IO[bytes], path: Path | None, file_format: str) -
         return _flat(pymeshlab.MeshSet(), copy)
 
 
-def _flat(meshes, path: Path) -> Parsed:  # noqa: ANN001
+def _flat(meshes: Any, path: Path) -> Parsed:
     meshes.load_new_mesh(str(path))
     parts = []
     for mesh in meshes:

@@ -1,9 +1,10 @@
 """OBJ: the numbers of the vertices through trimesh, the faces here.
 
-trimesh's reading of OBJ faces cannot be kept from working over what it reads: it counts relative indices from the
-end of the file instead of from the line they stand on, takes index 0 for 1, regroups faces by material and object,
-and splits vertices by texture coordinate. So the faces' position indices are read here, and trimesh gets the vertex
-lines alone, each cut down to three numbers where their lengths differ (it would read them as one flat table).
+trimesh's reading of OBJ faces cannot be kept from working over what it reads: it counts relative indices from
+the end of the file instead of from the line they stand on, takes index 0 for 1, regroups faces by material
+and object, and splits vertices by texture coordinate. So the faces' position indices are read here, and
+trimesh gets the vertex lines alone, each cut down to three numbers where their lengths differ (it would read
+them as one flat table).
 """
 
 from __future__ import annotations
@@ -30,9 +31,12 @@ VERTEX_LINE = re.compile(rb"^[ \t]*v[ \t]+(.*)$", re.MULTILINE)
 FACE_LINE = re.compile(rb"^[ \t]*fo?(?![^ \t\n])(.*)$", re.MULTILINE)
 OTHER_LINE = re.compile(rb"^[ \t]*(l|p|curv|curv2|surf)[ \t]", re.MULTILINE)
 
+# trimesh leaves such a sign out and so would read 3.1-e2 as 310.
+BROKEN_EXPONENT = re.compile(rb"[+-]e", re.IGNORECASE)
+
 
 def read_obj(file: IO[bytes]) -> Parsed:
-    """Read an OBJ file: positions and faces of all objects and groups, in file order; n-gons are cut into fans.
+    """Read an OBJ file: the faces of all objects and groups in file order; n-gons are cut into fans.
 
     Raises:
         UnreadableMeshError: Naming the vertex or face where something is no number or cannot be an index.
@@ -61,13 +65,20 @@ def _read_vertices(lines: list[bytes]) -> np.ndarray:
         raise UnreadableMeshError(f"vertex {short + 1} has fewer than 3 coordinates", remedy=EXPORT_AGAIN)
     if len(lengths) > 1:
         lines = [b" ".join(line.split()[:3]) for line in lines]
+    table = b"v " + b"\nv ".join(lines) + b"\n"
+    odd = BROKEN_EXPONENT.search(table)
+    if odd:
+        place = table.count(b"\n", 0, odd.start()) + 1
+        raise UnreadableMeshError(
+            f"vertex {place} has a number with a sign before its exponent", remedy=EXPORT_AGAIN
+        )
     with strict_numbers():
-        return load_obj(BytesIO(b"v " + b"\nv ".join(lines) + b"\n"))["vertices"]
+        return load_obj(BytesIO(table))["vertices"]
 
 
 def _read_corners(text: bytes, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
     """How many corners each face has, and their vertices counted from 0."""
-    lines = [line.group(1) for line in FACE_LINE.finditer(text)]
+    lines = FACE_LINE.findall(text)
     lengths = np.array([len(line.split()) for line in lines], np.int64)
     corners = numbers(re.sub(rb"/\S*", b"", b" ".join(lines)), np.int64)
     face = np.repeat(np.arange(len(lengths)), lengths)

@@ -1,7 +1,7 @@
 """OFF through trimesh, which gets the numbers it needs and no more.
 
-trimesh sorts mixed polygons by their number of corners and drops faces of two corners without a word. So polygons
-are cut into fans here, in file order, and it reads triangles.
+trimesh sorts mixed polygons by their number of corners and drops faces of two corners without a word. So
+polygons are cut into fans here, in file order, and it reads triangles.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ def _read_counts(lines: list[bytes]) -> tuple[int, int, list[bytes]]:
     vertices, faces = (int(one) for one in counts)
     if vertices + faces > len(lines) - 1:
         raise UnreadableMeshError(
-            f"the OFF file announces {vertices} vertices and {faces} faces, but only {len(lines) - 1} lines follow",
+            f"the OFF file announces {vertices} vertices and {faces} faces,"
+            f" but only {len(lines) - 1} lines follow",
             remedy="the file is cut short or its counts are wrong",
         )
     return vertices, faces, lines[1:]

@@ -1,4 +1,4 @@
-"""What every reader returns, and what several of them need: fans, notes, parts put together, trimesh kept quiet."""
+"""What every reader returns, and what several need: fans, notes, parts put together, trimesh kept quiet."""
 
 from __future__ import annotations
 
@@ -52,7 +52,8 @@ def fan_out(lengths: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple
         corners: `(sum of lengths,)` vertex indices, polygon by polygon.
 
     Returns:
-        `(f, 3)` faces and notes: how many polygons were cut, how many had fewer than 3 corners and are left out.
+        `(f, 3)` faces and notes: how many polygons were cut, how many had fewer than 3 corners and are left
+        out.
     """
     lengths = np.asarray(lengths, np.int64)
     triangles = np.maximum(lengths - 2, 0)
@@ -121,7 +122,10 @@ def numbers(text: bytes, dtype: type = np.float64) -> np.ndarray:
 
 @contextmanager
 def strict_numbers() -> Iterator[None]:
-    """Make NumPy's half-read texts and impossible casts an error, and other warnings of the block silent."""
+    """Make NumPy's half-read texts and impossible casts an error, and other warnings of the block silent.
+
+    A half-read text is a warning up to NumPy 2.3 and an error since.
+    """
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     try:
         with warnings.catch_warnings():
@@ -129,5 +133,7 @@ def strict_numbers() -> Iterator[None]:
             warnings.filterwarnings("error", message="string or file could not be read")
             warnings.filterwarnings("error", message="invalid value encountered in cast")
             yield
-    except (DeprecationWarning, RuntimeWarning) as warning:
-        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN) from warning
+    except (DeprecationWarning, RuntimeWarning, ValueError) as error:
+        if isinstance(error, ValueError) and "string or file could not be read" not in str(error):
+            raise
+        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN) from error

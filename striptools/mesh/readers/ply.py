@@ -1,10 +1,10 @@
 """PLY, binary and ASCII.
 
-The header is read here and checked against the size of the file before anything is allocated. A binary file whose
-lists all have one length, the ordinary case, goes through trimesh. trimesh refuses lists of several lengths in a
-binary file, trusts the first list's length for all others, splits vertices by texture coordinate and turns the
-order of mixed polygons about; so what its fast path does not read faithfully, and all ASCII files, are walked row
-by row (kernels/rows.py). A test holds the two ways equal.
+The header is read here and checked against the size of the file before anything is allocated. A binary file
+whose lists all have one length, the ordinary case, goes through trimesh. trimesh refuses lists of several
+lengths in a binary file, trusts the first list's length for all others, splits vertices by texture coordinate
+and turns the order of mixed polygons about; so what its fast path does not read faithfully, and all ASCII
+files, are walked row by row (kernels/rows.py). A test holds the two ways equal.
 """
 
 from __future__ import annotations
@@ -145,7 +145,8 @@ def check_sizes(header: Header, size: int) -> None:
         # The last row of an ASCII file may lack its line end.
         if element.rows * least > left + (not header.order):
             raise UnreadableMeshError(
-                f"the PLY header announces {element.rows} rows of `{element.name}`, but only {max(left, 0)} bytes follow",
+                f"the PLY header announces {element.rows} rows of `{element.name}`,"
+                f" but only {max(left, 0)} bytes follow",
                 remedy="the file is cut short or its header is wrong",
             )
         left -= element.rows * least

@@ -1,7 +1,7 @@
 """STL, binary and ASCII, through trimesh; its header and its facets are checked before.
 
-Left to itself trimesh regroups the vertices of facets that have more or fewer than three, drops a solid that has
-no end without a word, and takes the word `vertex` in a solid's name for one.
+Left to itself trimesh regroups the vertices of facets that have more or fewer than three, drops a solid that
+has no end without a word, and takes the word `vertex` in a solid's name for one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ from striptools.mesh.readers.parsed import (
 HEADER = 84
 FACET = 50
 NAME = re.compile(rb"^[ \t]*(end)?solid\b.*$", re.MULTILINE | re.IGNORECASE)
-KEYWORD = re.compile(rb"\b(endfacet|facet|vertex)\b", re.IGNORECASE)
+# A vertex counts only with three words behind it and then another vertex or the end of the loop.
+KEYWORD = re.compile(
+    rb"\b(endfacet|facet|vertex(?=(?:[ \t]+\S+){3}\s+(?:vertex|endloop)\b))\b", re.IGNORECASE
+)
 ONE_FACET = [b"facet", b"vertex", b"vertex", b"vertex", b"endfacet"]
 
 
@@ -84,8 +87,6 @@ def _read_text(data: bytes) -> Parsed:
         found = load_stl_ascii(BytesIO(text))
     solids = [found] if "vertices" in found else list(found["geometry"].values())
     parts = [Parsed(solid["vertices"], solid["faces"]) for solid in solids]
-    if sum(len(part.faces) for part in parts) != facets:
-        raise UnreadableMeshError("a facet of the STL file lacks a coordinate", remedy=EXPORT_AGAIN)
     whole = flatten(parts)
     notes = (f"{len(parts)} solids flattened into one mesh",) if len(parts) > 1 else ()
     return Parsed(narrow(whole.positions), whole.faces, notes)
