@@ -99,7 +99,7 @@ def test_what_comes_out_is_clean(mesh, drop_duplicates, weld):
     np.testing.assert_array_equal(bits(again.mesh.positions), bits(once.mesh.positions))
 
 
-@given(meshes(), st.sampled_from([1e-9, 1e-3, 0.5, 3.0, 1e6]))
+@given(meshes(), st.sampled_from([1e-310, 1e-40, 1e-9, 1e-3, 0.5, 3.0, 1e6, 1e300]))
 def test_welding_moves_no_vertex_farther_than_it_says(mesh, weld):
     positions = mesh.positions
     leader, error = weld_vertices(positions, weld)
@@ -135,6 +135,16 @@ def test_a_chain_of_close_vertices_does_not_collapse():
     leader, error = weld_vertices(positions, 1.0)
     assert leader.tolist() == [0, 0, 2, 2, 4]
     assert error == 0.75
+
+
+@given(st.floats(1e-6, 1e6), st.integers(-(2**20), 2**20))
+def test_neighbours_at_the_very_distance_are_found_across_cells(unit, step):
+    x = np.array([step * unit, (step + 1) * unit], np.float32)
+    distance = abs(float(x[1]) - float(x[0]))
+    positions = np.stack([x, 0 * x, 0 * x], axis=1)
+    if distance > 0:
+        assert weld_vertices(positions, distance)[0].tolist() == [0, 0]
+        assert weld_vertices(positions, np.nextafter(distance, 0))[0].tolist() == [0, 1]
 
 
 @given(meshes(hostile=False))

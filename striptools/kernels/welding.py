@@ -4,6 +4,8 @@ import numpy as np
 from numba import njit
 
 LOW_WORD = np.uint64(0xFFFFFFFF)
+SMALLEST_CELL = 1e-44
+"""In the unit of the points: a finer grid than float32 would overflow and tell nothing more apart."""
 
 
 @njit(cache=True, nogil=True)
@@ -80,6 +82,8 @@ def nearest_leaders(points, distance):
     older = np.full(count, -1, np.int32)
     leader = np.empty(count, np.int32)
     farthest = 0.0
+    # Cells a little wider than the distance: no rounding of a quotient moves a neighbour two cells away.
+    cell = 1.001 * max(distance, SMALLEST_CELL)
     for point in range(count):
         leader[point] = point
         x = np.float64(points[point, 0])
@@ -87,9 +91,9 @@ def nearest_leaders(points, distance):
         z = np.float64(points[point, 2])
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
             continue
-        column = np.floor(x / distance)
-        line = np.floor(y / distance)
-        layer = np.floor(z / distance)
+        column = np.floor(x / cell)
+        line = np.floor(y / cell)
+        layer = np.floor(z / cell)
 
         # Look through the 27 cells round the point; other cells that share a slot do no harm.
         best = np.inf
