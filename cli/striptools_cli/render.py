@@ -1,6 +1,8 @@
 """`striptools render`: a picture of a scene file, drawn by the tracer that verify proves."""
 
+import inspect
 import time
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -9,15 +11,16 @@ from striptools.errors import UsageError
 from striptools.reducem.reader import read_scene
 from striptools.trace import Tracer
 from striptools.trace.device import DeviceKind
-from striptools.trace.rays import THREE_QUARTER, Camera
+from striptools.trace.rays import Camera
 from striptools.trace.render import RenderOptions, Shading, render, save_png
 from striptools_cli import log, notice
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes
-from striptools_cli.streams import STANDARD, Source, Target, output_format, refuse_same, say
+from striptools_cli.streams import STANDARD, Source, Target, refuse_same, say
 
 _DEFAULTS = RenderOptions()
-_VIEW = ",".join(str(part) for part in THREE_QUARTER)
+_FRAMING = {name: option.default for name, option in inspect.signature(Camera.framing).parameters.items()}
+_VIEW = ",".join(str(part) for part in _FRAMING["view"])
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -26,18 +29,22 @@ def run(
     scene: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
     target: Annotated[str, typer.Argument(metavar="OUT.png", help="Picture; - for standard output.")],
     shading: Annotated[Shading, typer.Option(help="What the colours say.")] = _DEFAULTS.shading,
-    width: Annotated[int, typer.Option(min=1, max=16384, metavar="N", help="Pixels across.")] = 800,
-    height: Annotated[int, typer.Option(min=1, max=16384, metavar="N", help="Pixels down.")] = 600,
+    width: Annotated[int, typer.Option(min=1, max=16384, metavar="N", help="Pixels across.")] = _FRAMING[
+        "width"
+    ],
+    height: Annotated[int, typer.Option(min=1, max=16384, metavar="N", help="Pixels down.")] = _FRAMING[
+        "height"
+    ],
     samples: Annotated[
         int, typer.Option(min=1, max=8, metavar="N", help="N x N rays a pixel.")
     ] = _DEFAULTS.samples,
     fov: Annotated[
         float, typer.Option(min=0.1, max=169.0, metavar="DEGREES", help="Angle across the shorter side.")
-    ] = 35.0,
+    ] = _FRAMING["fov"],
     view: Annotated[
         str, typer.Option(metavar="R,U,F", help="Where the eye is: right, up and front parts.")
     ] = _VIEW,
-    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = "y",
+    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = _FRAMING["up"],
     force: Annotated[bool, typer.Option("--force", help="Replace OUT.png where it exists.")] = False,
     device: Annotated[
         DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
@@ -53,7 +60,8 @@ def run(
     costs. A view that begins with a minus sign is written --view=-1,0,0.
     """
     log.set_up(quiet=quiet)
-    output_format("x.png" if target == STANDARD else target, None, ("png",))
+    if target != STANDARD and Path(target).suffix.lower() != ".png":
+        raise UsageError("no name of a PNG picture", where=target, remedy="end it in .png")
     refuse_same(scene, target)
     place = _parsed_view(view)
     out, file = Target.open(target, force=force), Source.open(scene)
