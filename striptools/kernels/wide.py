@@ -11,6 +11,15 @@ EMPTY = np.int32(-(2**31))
 
 
 @njit(cache=True, nogil=True)
+def half_area(boxes, p):
+    """Half the surface area of one box, in float64: finite for all finite boxes."""
+    dx = np.float64(boxes[p, 3]) - boxes[p, 0]
+    dy = np.float64(boxes[p, 4]) - boxes[p, 1]
+    dz = np.float64(boxes[p, 5]) - boxes[p, 2]
+    return dx * dy + dy * dz + dz * dx
+
+
+@njit(cache=True, nogil=True)
 def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
     """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
 
@@ -25,17 +34,16 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
         split: (2n-1, 9) int8; `split[p, j]`, j >= 2, says how many of j children the left subtree gets, 0
             means that fewer than j are as cheap; `split[p, 8]` is the split of p as a wide node of its own.
         as_leaf: (2n-1,) bool, p standing alone is cheapest as a leaf.
-        cost: The summed cost of the whole tree, in units of the surface half-area times the costs given.
+        cost: The expected cost of the whole tree for a ray that meets the root's box.
     """
     count = len(size)
     cost = np.empty((count, WIDTH), np.float32)
     split = np.zeros((count, WIDTH + 1), np.int8)
     as_leaf = np.zeros(count, np.bool_)
+    root = half_area(boxes, 0)
+    unit = 1.0 / root if root > 0.0 else 1.0
     for p in range(count - 1, -1, -1):
-        dx = boxes[p, 3] - boxes[p, 0]
-        dy = boxes[p, 4] - boxes[p, 1]
-        dz = boxes[p, 5] - boxes[p, 2]
-        area = dx * dy + dy * dz + dz * dx
+        area = np.float32(half_area(boxes, p) * unit)
 
         # Let a single triangle be a leaf however many children are on offer.
         if size[p] == 1:

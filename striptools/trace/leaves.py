@@ -1,5 +1,6 @@
 """A scene laid out for the walk: wide nodes, leaf blocks, and the way from a face to its place."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -102,14 +103,13 @@ def scale_of(scene: "Scene") -> np.float32:
 
 
 def size_class(count: int) -> int:
-    """The least of 64, 76, 91, 108, 128, ... (four steps to each doubling) that is at least `count`.
+    """The least of 1024, 1218, 1449, 1723, 2048, ... (four steps to each doubling) that is at least `count`.
 
     A program is compiled for the sizes of its arrays: scenes of the same class share it.
     """
-    size = 64
-    while size < count:
-        quarters = round(4 * np.log2(size)) + 1
-        size = int(np.ceil(2 ** (quarters / 4)))
+    quarters = 40
+    while (size := math.ceil(2 ** (quarters / 4))) < count:
+        quarters += 1
     return size
 
 

@@ -1,5 +1,6 @@
 """The tracer: rays in, closest hits or any hits out."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,7 +49,7 @@ class Tracer:
     def _take(self, layout: Layout) -> None:
         self._layout = layout
         self._scene = replicate(layout.arrays, self._mesh)
-        self._stack_size = -(-(layout.depth + 2) // 8) * 8
+        self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
 
     @property
     def devices(self) -> list[Any]:

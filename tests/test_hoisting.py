@@ -1,0 +1,51 @@
+"""The compiled walks are hoisted: each loop is one native function, not a thunk per operation."""
+
+import re
+
+import jax
+import numpy as np
+import pytest
+from scenes import small_scene
+
+from striptools.trace import Tracer
+from striptools.trace.launch import program
+from striptools.trace.walk_wide import WalkOptions
+
+
+def loops_outside_hoisted_calls(text):
+    """While instructions of a compiled program that do not stand in the computation of a hoisted loop."""
+    outside = []
+    for computation in re.split(r"\n(?=(?:ENTRY )?%)", text):
+        loops = re.findall(r"= [^\n]* while\(", computation)
+        if loops and not re.match(r"%?while[\w.\-]*_computation", computation.strip()):
+            outside += loops
+    return outside
+
+
+def compiled_text(any_hit, steps=False):
+    tracer = Tracer(small_scene(), device="cpu")
+    options = tracer._options(any_hit=any_hit, steps=steps)
+    rays = np.zeros((256 * len(tracer.devices), 3), np.float32)
+    lowered = program(tracer._mesh, options).lower(tracer._scene, rays, rays, rays[:, 0])
+    return lowered.compile().as_text()
+
+
+@pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
+def test_walks_are_hoisted(any_hit, steps):
+    text = compiled_text(any_hit, steps)
+    assert 'xla_cpu_small_call="true"' in text
+    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
+    assert loops_outside_hoisted_calls(text) == []
+
+
+def test_a_loop_that_is_not_hoisted_would_be_seen():
+    def scatters(values):
+        return jax.lax.fori_loop(0, 1000, lambda i, s: s.at[(values + i) % 64].set(i), np.zeros(64, np.int32))
+
+    text = jax.jit(scatters).lower(np.arange(8)).compile().as_text()
+    assert text is not None
+    assert loops_outside_hoisted_calls(text)
+
+
+def test_options_tell_programs_apart():
+    assert WalkOptions(2, False, False, 16) != WalkOptions(2, True, False, 16)

@@ -1,0 +1,444 @@
+"""The tracer: equal to trying every triangle, watertight, the same whatever the order, threads or walk."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import scene_of, scenes, small_scene
+from strategies import book, cube, fan, grid, soup, sphere, stack
+
+from striptools.errors import StriptoolsError, UsageError
+from striptools.mesh.mesh import Mesh
+from striptools.trace import Tracer
+from striptools.trace.launch import _collect, _spread, tiles
+from striptools.trace.leaves import lay_out, scale_of, size_class
+from striptools.trace.walk_wide import DONE, WalkOptions, trace_rays
+
+LOWEST = np.finfo(np.float32).min
+
+
+# ---- Trying every triangle, in the tracer's own float32 arithmetic written out in NumPy.
+
+
+def flushed(value):
+    """XLA takes denormals for zeros, in and out."""
+    return np.where(np.abs(value) < np.finfo(np.float32).tiny, value * np.float32(0), value).astype(
+        np.float32
+    )
+
+
+def rounded(product):
+    return flushed(np.where(product > LOWEST, product, LOWEST))
+
+
+def named_corners(scene):
+    """Corners of each triangle from its smallest, the face reported for it, its turn from the source's."""
+    faces = scene.faces()
+    corners = scene.positions[faces] * scale_of(scene)
+    order = np.array([min(range(3), key=lambda j: tuple(row[j] + 0.0)) for row in corners])
+    turned = np.take_along_axis(corners, ((np.arange(3) + order[:, None]) % 3)[..., None], axis=1)
+    if scene.remap is None:
+        return turned, np.arange(len(faces)), order % 3
+    return turned, scene.remap.face, (order + scene.remap.rotation) % 3
+
+
+@np.errstate(all="ignore")
+def try_every_triangle(scene, origins, directions, t_max=np.inf):
+    """Least t, then least face, of every triangle for every ray: (t, face, u, v)."""
+    corners, ids, turns = named_corners(scene)
+    best = []
+    for o, d in zip(origins * scale_of(scene), directions, strict=True):
+        best.append(_try_one(corners, ids, turns, o, d, np.float32(t_max) * scale_of(scene)))
+    t, face, u, v = (np.array(column) for column in zip(*best, strict=True))
+    return (t / scale_of(scene)).astype(np.float32), face, u, v
+
+
+def _try_one(corners, ids, turns, o, d, t_max):
+    miss = (np.float32(np.inf), -1, np.float32(0), np.float32(0))
+    if not (np.isfinite(o).all() and np.isfinite(d).all() and np.abs(d).max() >= np.finfo(np.float32).tiny):
+        return miss
+    o, d = flushed(o), flushed(d)
+    length = np.float32(2.0) ** np.floor(np.log2(np.abs(d).max()))
+    d, t_max = flushed(d / length), t_max * length
+    z = int(np.argmax(np.abs(d)))
+    x, y = (z + 1) % 3, (z + 2) % 3
+    sx, sy, sz = d[x] / d[z], d[y] / d[z], np.float32(1) / d[z]
+    p = flushed(flushed(corners) - o)
+    px, py = (flushed(p[..., k] - rounded(s * p[..., z])) for k, s in ((x, flushed(sx)), (y, flushed(sy))))
+    height = rounded(p[..., z] * sz)
+
+    def edge(i, j):
+        return flushed(rounded(px[:, i] * py[:, j]) - rounded(py[:, i] * px[:, j]))
+
+    a, b, c = edge(2, 1), edge(0, 2), edge(1, 0)
+    inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
+    whole = a + b + c
+    t = rounded(a * height[:, 0]) + rounded(b * height[:, 1]) + rounded(c * height[:, 2])
+    t = np.where(whole < 0, -t, t) / np.abs(whole)
+    hit = np.flatnonzero(inside & (whole != 0) & (t > 0) & (t < t_max))
+    if not len(hit):
+        return miss
+    k = hit[np.lexsort((ids[hit], t[hit]))[0]]
+    weights = np.array([a[k], b[k], c[k]]) / whole[k]
+    by_corner = weights[(np.arange(3) - turns[k]) % 3]
+    return t[k] / length, ids[k], by_corner[1], by_corner[2]
+
+
+def assert_same_hits(scene, hits, expected):
+    t, face, u, v = expected
+    np.testing.assert_array_equal(hits.face, face)
+    np.testing.assert_array_equal(hits.t, t)
+    np.testing.assert_allclose(hits.u, u, atol=1e-6)
+    np.testing.assert_allclose(hits.v, v, atol=1e-6)
+    ids = np.arange(scene.triangle_count) if scene.remap is None else scene.remap.face
+    np.testing.assert_array_equal(np.where(hits.triangle < 0, -1, ids[hits.triangle]), face)
+
+
+# ---- Rays from where bugs live.
+
+
+@np.errstate(all="ignore")
+def aimed_rays(positions, faces, count, seed):
+    """Rays at vertices, edges and insides of triangles, along axes, in planes of boxes, and into nothing."""
+    random = np.random.default_rng(seed)
+    low, high = positions.min(axis=0).astype(np.float64), positions.max(axis=0).astype(np.float64)
+    size = max(float(np.linalg.norm(high - low)), float(np.abs(positions).max()) * 1e-3, 1e-30)
+    corners = positions[faces[random.integers(0, len(faces), count)]].astype(np.float64)
+    kinds = random.integers(0, 3, count)
+    weights = np.where((kinds == 0)[:, None], [[1.0, 0, 0]], random.dirichlet(np.ones(3), count))
+    weights = np.where((kinds == 1)[:, None], [[0.5, 0.5, 0]], weights)
+    target = (corners * weights[..., None]).sum(axis=1).astype(np.float32)
+    origins = (target + size * random.normal(size=(count, 3))).astype(np.float32)
+    axial = random.random(count) < 0.4
+    axis = random.integers(0, 3, count)
+    keep = np.arange(3) == axis[:, None]
+    origins[axial] = np.where(keep, origins, target)[axial]
+    directions = target - origins
+    directions[random.random((count, 3)) < 0.05] *= np.float32(-1)
+    directions[axial & (random.random(count) < 0.5)] += np.float32(0)
+    zero = (directions == 0) & (random.random((count, 3)) < 0.5)
+    directions[zero] = -0.0
+    directions *= (np.float32(10.0) ** random.integers(-3, 4, count).astype(np.float32))[:, None]
+    return origins, directions
+
+
+@settings(max_examples=30)
+@given(scenes(), st.integers(0, 2**32 - 1))
+def test_equals_trying_every_triangle(drawn, seed):
+    _, scene = drawn
+    origins, directions = aimed_rays(scene.positions, scene.faces(), 60, seed)
+    tracer = Tracer(scene, device="cpu", threads=1)
+    hits = tracer.closest_hit(origins, directions)
+    assert_same_hits(scene, hits, try_every_triangle(scene, origins, directions))
+    np.testing.assert_array_equal(tracer.any_hit(origins, directions), hits.hit)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    positions, faces = sphere(3)
+    return scene_of(Mesh(positions, faces))
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [grid(20, 20), fan(300), book(26), soup(600, 1, 1000), soup(300, 2, 3), stack(40), cube(), sphere(3)],
+)
+@pytest.mark.parametrize("remap", [True, False])
+def test_shapes_equal_trying_every_triangle(shape, remap):
+    scene = scene_of(Mesh(*clean(shape)), remap=remap, spare_faces=3)
+    origins, directions = aimed_rays(scene.positions, scene.faces(), 300, 5)
+    hits = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
+    assert_same_hits(scene, hits, try_every_triangle(scene, origins, directions))
+    assert hits.hit.sum() > 50
+
+
+def clean(shape):
+    from striptools.mesh.clean import clean as clean_mesh
+
+    mesh = clean_mesh(Mesh(*shape)).mesh
+    return mesh.positions, mesh.faces
+
+
+# ---- Against the truth in float64.
+
+
+def exact_hits(corners, origins, directions):
+    """Moeller-Trumbore in float64 over all triangles: least t, and how far each ray stays from all edges."""
+    a, b, c = (corners[:, k].astype(np.float64) for k in range(3))
+    t_least, margin = [], []
+    for o, d in zip(origins.astype(np.float64), directions.astype(np.float64), strict=True):
+        p = np.cross(d, c - a)
+        det = np.einsum("ij,ij->i", b - a, p)
+        s = o - a
+        q = np.cross(s, b - a)
+        with np.errstate(all="ignore"):
+            u, v, t = np.einsum("ij,ij->i", s, p) / det, q @ d / det, np.einsum("ij,ij->i", c - a, q) / det
+        low = np.minimum(np.minimum(u, v), 1 - u - v)
+        met = (low >= 0) & (t > 0)
+        t_least.append(t[met].min() if met.any() else np.inf)
+        margin.append(np.nanmin(np.abs(low[t > 0]), initial=1.0))
+    return np.array(t_least), np.array(margin)
+
+
+def test_agrees_with_float64(ball):
+    random = np.random.default_rng(3)
+    origins = random.normal(size=(400, 3)).astype(np.float32) * 2
+    directions = random.normal(size=(400, 3)).astype(np.float32) * 3 - origins
+    hits = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
+    t, margin = exact_hits(ball.positions[ball.faces()], origins, directions)
+    clear = margin > 1e-4
+    assert clear.mean() > 0.5
+    np.testing.assert_array_equal(np.isfinite(hits.t)[clear], np.isfinite(t)[clear])
+    both = clear & np.isfinite(t)
+    np.testing.assert_allclose(hits.t[both], t[both], rtol=2e-5)
+
+
+def test_u_and_v_give_the_point_from_the_sources_first_corner():
+    positions, faces = sphere(2)
+    random = np.random.default_rng(1)
+    faces = np.take_along_axis(faces, (np.arange(3) + random.integers(0, 3, (len(faces), 1))) % 3, axis=1)
+    scene = scene_of(Mesh(positions, faces))
+    origins = random.normal(size=(500, 3)).astype(np.float32) * 0.2
+    directions = random.normal(size=(500, 3)).astype(np.float32)
+    hits = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
+    assert hits.hit.all()
+    a, b, c = (positions[faces[hits.face, k]] for k in range(3))
+    u, v = hits.u[:, None], hits.v[:, None]
+    np.testing.assert_allclose(
+        (1 - u - v) * a + u * b + v * c, origins + hits.t[:, None] * directions, atol=3e-6
+    )
+
+
+# ---- No ray slips through.
+
+
+@pytest.mark.parametrize(("scale", "move"), [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 100.0)])
+def test_no_ray_leaves_a_closed_sphere(scale, move):
+    points, faces = sphere(4)
+    diagonal = np.linalg.norm(np.ptp(points, axis=0))
+    centre = np.array([move, -move, move]) * diagonal * scale
+    positions = (points.astype(np.float64) * scale + centre).astype(np.float32)
+    tracer = Tracer(scene_of(Mesh(positions, faces)), device="cpu")
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)
+    targets = np.concatenate([positions[edges].astype(np.float64).mean(axis=1), positions])
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        origin = (centre + random.normal(size=3) * 0.2 * scale).astype(np.float32)
+        wobble = 1 + 2 * random.random((9, 1, 1))
+        directions = ((targets - origin) * wobble).astype(np.float32).reshape(-1, 3)
+        assert len(directions) > 33_000
+        assert tracer.any_hit(np.broadcast_to(origin, directions.shape), directions).all()
+        assert tracer.closest_hit(np.broadcast_to(origin, directions.shape), directions).hit.all()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rays_along_axes_in_the_planes_of_boxes_hit(axis, sign):
+    positions, faces = clean(cube())
+    scene = scene_of(Mesh(positions, faces))
+    others = [k for k in range(3) if k != axis]
+    lattice = np.array([[i, j] for i in (0, 0.25, 0.5, 1) for j in (0, 0.25, 0.5, 1)], np.float32)
+    origins = np.full((len(lattice), 3), -5.0 * sign, np.float32)
+    origins[:, others] = lattice
+    inside = ((lattice > 0) & (lattice < 1)).all(axis=1)
+    tracer = Tracer(scene, device="cpu", threads=1)
+    for zero in (0.0, -0.0, 1e-30, -1e-30):
+        directions = np.full_like(origins, zero)
+        directions[:, axis] = sign
+        hits = tracer.closest_hit(origins, directions)
+        # What leans outward by 1e-30 rightly misses from the rim.
+        assert hits.hit[inside | (zero == 0)].all()
+        np.testing.assert_array_equal(hits.t[hits.hit], 5.0 if sign > 0 else 4.0)
+
+
+# ---- The same whatever the way.
+
+
+def test_order_of_faces_and_remap_change_nothing_but_names(ball):
+    random = np.random.default_rng(2)
+    positions, faces = sphere(3)
+    shuffle = random.permutation(len(faces))
+    turned = np.take_along_axis(
+        faces[shuffle], (np.arange(3) + random.integers(0, 3, (len(faces), 1))) % 3, axis=1
+    )
+    origins, directions = aimed_rays(positions, faces, 2000, 1)
+    first = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
+    for scene in (
+        scene_of(Mesh(positions, turned), max_length=3),
+        scene_of(Mesh(positions, faces), remap=False),
+    ):
+        other = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
+        np.testing.assert_array_equal(other.t, first.t)
+
+
+def test_all_threads_give_what_one_gives(ball):
+    origins, directions = aimed_rays(ball.positions, ball.faces(), 5001, 4)
+    one = Tracer(ball, device="cpu", threads=1)
+    all_cores = Tracer(ball, device="cpu")
+    assert len(one.devices) == 1
+    first, other = one.closest_hit(origins, directions), all_cores.closest_hit(origins, directions)
+    for name in ("t", "face", "u", "v", "triangle"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
+
+
+def test_walking_all_rays_at_once_gives_the_same(ball):
+    origins, directions = aimed_rays(ball.positions, ball.faces(), 200, 6)
+    expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
+    options = WalkOptions(1, any_hit=False, count_steps=True, stack_size=16, batch=True)
+    reach = np.full(len(origins), np.inf, np.float32)
+    traced = jax.jit(trace_rays, static_argnames="options")(
+        lay_out(ball).arrays, origins, directions, reach, options=options
+    )
+    np.testing.assert_array_equal(traced.t, expected.t)
+    np.testing.assert_array_equal(traced.face, expected.face)
+    np.testing.assert_allclose(traced.u, expected.u, atol=1e-6)
+    assert np.asarray(traced.steps).min() >= 1
+
+
+def test_power_of_two_units_change_nothing(ball):
+    origins, directions = aimed_rays(ball.positions, ball.faces(), 500, 8)
+    expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
+    for unit in (np.float32(2.0**-40), np.float32(2.0**40)):
+        scene = replace(
+            ball,
+            positions=ball.positions * unit,
+            hierarchy=replace(ball.hierarchy, boxes=ball.hierarchy.boxes * unit),
+        )
+        tracer = Tracer(scene, device="cpu", threads=1)
+        hits = tracer.closest_hit(origins * unit, directions * unit * np.float32(2.0**20))
+        np.testing.assert_array_equal(hits.t * np.float32(2.0**20), expected.t)
+        np.testing.assert_array_equal(hits.face, expected.face)
+
+
+# ---- What is asked, and how.
+
+
+def test_steps_are_counted_only_when_asked(ball):
+    origins, directions = aimed_rays(ball.positions, ball.faces(), 100, 9)
+    tracer = Tracer(ball, device="cpu", threads=1)
+    plain, counted = (
+        tracer.closest_hit(origins, directions),
+        tracer.closest_hit(origins, directions, steps=True),
+    )
+    assert plain.steps is None
+    assert counted.steps is not None
+    np.testing.assert_array_equal(plain.t, counted.t)
+    assert counted.steps[counted.hit].min() >= 2
+    assert (counted.steps[~counted.hit] >= 1).all()
+
+
+def test_hits_beyond_t_max_do_not_count(ball):
+    origins = np.zeros((4, 3), np.float32)
+    directions = np.tile(np.float32([[0.3, 0.2, 0.7]]), (4, 1))
+    tracer = Tracer(ball, device="cpu", threads=1)
+    t = tracer.closest_hit(origins, directions).t[0]
+    limits = np.array([t, np.nextafter(t, np.float32(9)), 0, np.nan], np.float32)
+    np.testing.assert_array_equal(
+        tracer.closest_hit(origins, directions, t_max=limits).hit, [False, True, False, False]
+    )
+    np.testing.assert_array_equal(
+        tracer.any_hit(origins, directions, t_max=limits), [False, True, False, False]
+    )
+    assert not tracer.any_hit(origins, directions, t_max=float(t)).any()
+    assert tracer.any_hit(origins, directions, t_max=float(t) * 2).all()
+
+
+def test_rays_that_are_none_miss(ball):
+    bad = [np.nan, np.inf, -np.inf]
+    origins = np.zeros((13, 3), np.float32)
+    directions = np.ones((13, 3), np.float32)
+    for k, value in enumerate(bad):
+        origins[k, k] = value
+        directions[3 + k, k] = value
+    directions[6] = 0
+    directions[7] = -0.0
+    directions[8] = 1e-45
+    origins[9] = 3e38
+    tracer = Tracer(ball, device="cpu", threads=1)
+    hits = tracer.closest_hit(origins, directions)
+    np.testing.assert_array_equal(hits.hit, [False] * 10 + [True] * 3)
+    np.testing.assert_array_equal(tracer.any_hit(origins, directions), hits.hit)
+    assert np.isinf(hits.t[:10]).all()
+    assert (hits.u[:10] == 0).all()
+    assert (hits.triangle[:10] == -1).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 255, 257, 600])
+def test_any_number_of_rays(ball, count):
+    origins, directions = np.zeros((count, 3)), np.ones((count, 3))
+    tracer = Tracer(ball, device="cpu")
+    hits = tracer.closest_hit(origins, directions)
+    assert hits.hit.shape == (count,)
+    assert hits.hit.all()
+    assert tracer.any_hit(origins, directions).shape == (count,)
+
+
+@given(st.integers(0, 10**7), st.integers(1, 70))
+def test_tiles_take_each_ray_once(count, devices):
+    sizes = (4, 64, 1024)
+    at = 0
+    for part, room in tiles(count, devices, sizes):
+        assert part.start == at
+        assert 0 < part.stop - part.start <= room * devices
+        assert room in sizes
+        at = part.stop
+        if at > 10**6:
+            return
+    assert at == count
+
+
+@given(st.integers(1, 64), st.sampled_from([1, 2, 3, 5]))
+def test_spreading_and_collecting_give_the_rays_back(count, devices):
+    rays = np.arange(count, dtype=np.float32) + 1
+    room = 16 * 64
+    spread = _spread(rays, devices, room)
+    _, (back,) = _collect(slice(10, 10 + count), room, [spread], devices)
+    np.testing.assert_array_equal(back, rays)
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "t_max"),
+    [
+        (np.zeros((2, 3)), np.zeros((3, 3)), None),
+        (np.zeros(3), np.zeros(3), None),
+        (np.zeros((2, 2)), np.zeros((2, 2)), None),
+        ([["a", "b", "c"]], np.zeros((1, 3)), None),
+        (np.zeros((1, 3), complex), np.zeros((1, 3)), None),
+        (np.zeros((2, 3)), np.ones((2, 3)), np.ones(3)),
+        (np.zeros((2, 3)), np.ones((2, 3)), "far"),
+        ([[1, 2, 3], [4]], np.ones((2, 3)), None),
+    ],
+)
+def test_wrong_arguments_are_told(ball, origins, directions, t_max):
+    with pytest.raises(UsageError):
+        Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions, t_max=t_max)
+
+
+def test_doubles_and_lists_are_taken(ball):
+    hits = Tracer(ball, device="cpu", threads=1).closest_hit([[0.0, 0, 0]], [[0, 0, 1e300]])
+    assert not hits.hit.any()
+    hits = Tracer(ball, device="cpu", threads=1).closest_hit([[0, 0, 0]], [[0, 0, 1]])
+    assert hits.t[0] == pytest.approx(1.0)
+
+
+def test_a_tree_that_goes_round_ends_and_is_told():
+    tracer = Tracer(small_scene(), device="cpu", threads=1)
+    layout = tracer._layout
+    child = layout.arrays.child.copy()
+    child[np.flatnonzero(child[:8] != DONE)] = 0
+    tracer._take(replace(layout, arrays=layout.arrays._replace(child=child)))
+    origins, directions = aimed_rays(small_scene().positions, small_scene().faces(), 50, 0)
+    with pytest.raises(StriptoolsError, match="did not end"):
+        tracer.closest_hit(origins, directions)
+    with pytest.raises(StriptoolsError, match="did not end"):
+        tracer.any_hit(origins, directions)
+
+
+def test_scenes_of_like_size_share_a_program():
+    assert size_class(1) == size_class(1024) == 1024
+    sizes = [size_class(k) for k in range(1, 10**5, 997)]
+    assert all(size >= k for size, k in zip(sizes, range(1, 10**5, 997), strict=True))
+    assert len(set(sizes)) < 30
