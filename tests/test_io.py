@@ -2,8 +2,6 @@ import io
 import json
 import os
 import sys
-import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -440,24 +438,25 @@ def test_other_formats_name_the_extra_that_reads_them(monkeypatch):
         read(b"something", "3ds")
 
 
-def test_other_formats_go_through_pymeshlab(monkeypatch, tmp_path):
-    class Part:
-        def transformed_vertex_matrix(self):
-            return POINTS.astype(np.float64)
+@pytest.mark.parametrize("suffix", ["3ds", "ctm", "dae", "wrl", "x3d"])
+def test_other_formats_go_through_pymeshlab(tmp_path, suffix):
+    pymeshlab = pytest.importorskip("pymeshlab", reason="the extra meshlab is not installed")
+    positions, faces = cube()
+    path = tmp_path / f"cube.{suffix}"
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(positions.astype(np.float64), faces))
+    meshes.save_current_mesh(str(path))
+    want = sorted(map(sorted, positions[faces].tolist()))
+    for mesh in (load_mesh(path), read(path.read_bytes(), suffix)):
+        assert sorted(map(sorted, mesh.positions[mesh.faces].tolist())) == want
+        assert any("pymeshlab" in note for note in mesh.notes)
 
-        def face_matrix(self):
-            return np.array([[0, 1, 2]], np.int32)
 
-    class MeshSet(list):
-        def load_new_mesh(self, path):
-            assert Path(path).read_bytes() == b"something"
-            self.extend([Part(), Part()])
-
-    monkeypatch.setitem(sys.modules, "pymeshlab", types.SimpleNamespace(MeshSet=MeshSet))
-    (tmp_path / "a.3ds").write_bytes(b"something")
-    for mesh in (read(b"something", "3ds"), load_mesh(tmp_path / "a.3ds")):
-        assert mesh.faces.tolist() == [[0, 1, 2], [5, 6, 7]]
-        assert "2 meshes flattened into one" in mesh.notes
+def test_what_pymeshlab_cannot_read_is_one_line():
+    pytest.importorskip("pymeshlab", reason="the extra meshlab is not installed")
+    with pytest.raises(UnreadableMeshError, match="malformed") as error:
+        read(b"no model at all", "3ds")
+    assert "\n" not in str(error.value)
 
 
 # ------------------------------------------------------------------------------------- atomic writing
