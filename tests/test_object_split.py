@@ -145,7 +145,7 @@ def test_items_with_one_centre_are_split_in_halves():
 
 
 def test_no_input_makes_a_tree_deeper_than_the_limit():
-    # Each point lies twice as far out as the one before, so that every split parts one or a few from the rest.
+    # Each point lies twice as far out as the one before, so that every split parts a few from the rest.
     place = np.float32(2.0) ** np.arange(-140, 120, dtype=np.float32)
     tree = split_objects(np.repeat(place[:, None], 6, axis=1))
     check_object_tree(tree)
