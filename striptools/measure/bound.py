@@ -52,7 +52,8 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    gamma_16 M of the ray in the sheared plane, and its z within gamma_16 M + D of t d_z.
 
 The bound holds while no product overflows: M < 2^40. Beyond that nothing is called certain. Its own
-arithmetic is float64, whose rounding is 2^-29 of the terms above.
+arithmetic is float64, whose rounding is 2^-29 of the terms above; a face that it cannot tell from a line,
+since the ray sees it edge-on, has no exact hit.
 """
 
 from dataclasses import dataclass
@@ -62,6 +63,9 @@ import numpy as np
 UNIT_ROUNDOFF = 2.0**-24
 LARGEST_COORDINATE = 2.0**40
 FLUSHED = 2.0**-122
+EDGE_ON = 2.0**-50
+"""A face whose doubled area is a smaller part of the products it is made of has none: float64 rounding."""
+
 BEYOND_FACE = 8.0
 """How many delta_v from the ray a face may lie and still be reported (term 5 of the head)."""
 
@@ -218,8 +222,10 @@ class _PlaneView:
         self.det_low = np.abs(self.det) - det_error
 
     def inside(self) -> np.ndarray:
+        """The exact answer, but for faces so nearly edge-on that float64 cannot tell them from a line."""
         one_sign = (self.cross >= 0).all(axis=0) | (self.cross <= 0).all(axis=0)
-        return one_sign & (self.det != 0)
+        noise = (self.r * np.roll(self.r, 1, axis=0)).sum(axis=0) * EDGE_ON
+        return one_sign & (np.abs(self.det) > noise)
 
     def weight(self, corner: int) -> np.ndarray:
         return np.where(self.det != 0, self.cross[corner] / np.where(self.det != 0, self.det, 1.0), 0.0)
@@ -241,7 +247,8 @@ class _PlaneView:
         either = np.where(self.det > 0, counter_clockwise, clockwise)
         either |= (self.det_low <= 0) & (counter_clockwise | clockwise)
         boxed = (self.x.min(axis=0) <= reach) & (self.x.max(axis=0) >= -reach)
-        return either & boxed & (self.y.min(axis=0) <= reach) & (self.y.max(axis=0) >= -reach)
+        boxed &= (self.y.min(axis=0) <= reach) & (self.y.max(axis=0) >= -reach)
+        return either & boxed | np.isinf(reach)
 
     def depth_and_bound(self, rounding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth of the face's plane at the ray, clamped to the face's range, and the bound of its error."""

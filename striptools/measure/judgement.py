@@ -169,7 +169,7 @@ class Judge:
     def _promote(
         self, frames: RayFrames, candidates: Candidates, doubtful: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """For doubtful pairs at an edge or a vertex: whether the faces there are certain together, and how far."""
+        """Doubtful pairs at an edge or a vertex: are the faces there certain together, and how far."""
         verdict, reach = np.zeros(len(doubtful), bool), np.full(len(doubtful), np.inf)
         row = self._row_of_face[candidates.face[doubtful]]
         near = ~candidates.pairs.clear[doubtful]

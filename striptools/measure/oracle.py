@@ -129,7 +129,7 @@ class Oracle:
             yield ray[part], self._finite_face[face[part]]
 
     def _vertex_codes(self, frames: RayFrames, rays: np.ndarray) -> np.ndarray:
-        """(vertices,) uint64: bit 16 g + i says vertex lies beyond ray i to the left, right, below, above (g)."""
+        """(vertices,) uint64: bit 16 g + i says it is beyond ray i to the left, right, below, above (g)."""
         rays = np.resize(rays, RAYS_A_WORD)
         across = _projections(frames, rays)
         origins = frames.origins[rays]
