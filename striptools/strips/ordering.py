@@ -176,7 +176,9 @@ def _join_in_rounds(faces: Faces, ring: Counts, tree: "ObjectTree", options: Ord
     return state
 
 
-# Notes. Stanford dragon (871,306 faces), cap 64, vertices per triangle / expected cost over the full SAH tree's:
-# the printed score 1.1661 / 1.191; distance alone 1.1589 / 1.173; balance alone 1.1634 / 1.513; distance 0.9 and
-# balance 0.1 1.1597 / 1.176. Cap 16, 32, 128: 1.2228 / 1.098, 1.1742 / 1.159, 1.1659 / 1.190. The bunny at cap 64:
-# 1.1212 / 1.248, distance alone 1.1167 / 1.232. So balance costs a little; the default stays what is printed.
+# Notes. Stanford dragon (871,306 faces), cap 64; vertices per triangle / expected cost over the full SAH
+# tree's: the printed score 1.1661 / 1.191; distance alone 1.1589 / 1.173; balance alone 1.1634 / 1.513;
+# distance 0.9
+# and balance 0.1 1.1597 / 1.176. Cap 16: 1.2228 / 1.098; cap 32: 1.1742 / 1.159; cap 128: 1.1659 / 1.190.
+# Bunny at cap 64: 1.1212 / 1.248; distance alone 1.1167 / 1.232. So balance costs a little; the default stays
+# what is printed.
