@@ -498,14 +498,25 @@ def test_progress_shows_only_on_a_terminal_and_only_after_a_second(monkeypatch) 
 
 
 def test_a_notice_comes_before_the_first_compilation(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(notice, "kernel_caches", lambda: {"a": (Path(), 0), "b": (Path(), 0)})
-    notice.before_kernels(quiet=True)
+    caches = {"striptools.kernels.a": (Path(), 0), "striptools.kernels.b": (Path(), 3)}
+    monkeypatch.setattr(notice, "kernel_caches", lambda: caches)
+    notice.before_kernels("a", quiet=True)
+    notice.before_kernels("b")
     assert capsys.readouterr().err == ""
-    notice.before_kernels()
+    notice.before_kernels("a")
     assert "compiling the kernels" in capsys.readouterr().err
-    monkeypatch.setattr(notice, "kernel_caches", lambda: {"a": (Path(), 0), "b": (Path(), 3)})
-    notice.before_kernels()
-    assert capsys.readouterr().err == ""
+
+
+def test_compiled_code_older_than_its_source_does_not_count(tmp_path: Path) -> None:
+    source, code = (
+        tmp_path / "kernel.py",
+        tmp_path / f"kernel.f-1.py{sys.version_info[0]}{sys.version_info[1]}.nbi",
+    )
+    source.touch()
+    code.touch()
+    assert notice._fresh_files(tmp_path, source) == 1
+    os.utime(code, (0, 0))
+    assert notice._fresh_files(tmp_path, source) == 0
 
 
 def test_the_kernel_caches_are_found(folder: Path) -> None:
@@ -513,3 +524,19 @@ def test_the_kernel_caches_are_found(folder: Path) -> None:
     assert "striptools.kernels.object_split" in caches
     assert all(path.is_dir() for path, files in caches.values() if files)
     assert sum(files for _, files in caches.values()) > 0
+
+
+@pytest.mark.parametrize(("verb", "code"), [("info", 0), ("doctor", 0), ("verify", 2), ("render", 2)])
+def test_without_jax_only_tracing_is_missing(folder: Path, tmp_path: Path, verb: str, code: int) -> None:
+    rest = {
+        "info": ["torus.rdm"],
+        "doctor": [],
+        "verify": ["torus.rdm", "--against", "torus.ply"],
+        "render": ["torus.rdm", str(tmp_path / "x.png")],
+    }
+    script = "import sys; sys.modules['jax'] = None; from striptools_cli.app import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", script, verb, *rest[verb]]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == code
+    if code:
+        assert_one_error_line(done.stderr, "JAX", "striptools[trace]")

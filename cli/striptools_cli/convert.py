@@ -145,7 +145,7 @@ def _check_names(source: str, target: str, report: str | None) -> None:
 def _to_scene(
     source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
 ) -> _Outcome:
-    notice.before_kernels(quiet=quiet)
+    notice.before_kernels("strip_ordering", quiet=quiet)
     clock = Stopwatch()
     with StageProgress(quiet=quiet) as progress:
         scene, report = convert_with_report(
@@ -172,7 +172,6 @@ def _to_scene(
 def _to_mesh(
     source: Source, target: Target, _options: Options, formats: tuple[str, str], quiet: bool
 ) -> _Outcome:
-    notice.before_kernels(quiet=quiet)
     with StageProgress(quiet=quiet) as progress:
         clock = Stopwatch(progress.watch)
         with clock.stage("load"):

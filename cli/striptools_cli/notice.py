@@ -11,23 +11,25 @@ from striptools_cli.streams import say
 _PYTHON = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 
-def before_kernels(*, quiet: bool = False) -> None:
-    """Say that the kernels are compiled now, where no earlier run has left them compiled."""
-    if not quiet and not any(files for _, files in kernel_caches().values()):
+def before_kernels(module: str, *, quiet: bool = False) -> None:
+    """Say that kernels are compiled now, where no earlier run has left those of `module` compiled."""
+    if not quiet and not _is_compiled(module):
         say(
-            "striptools: compiling the kernels for this machine, once; later runs start at once\n", error=True
+            "striptools: compiling the kernels, once; this takes a while, later runs start at once\n",
+            error=True,
         )
 
 
 def before_tracing(*, quiet: bool = False) -> None:
     """Say that the tracer is compiled now, where no earlier run has left it compiled."""
     folder = tracer_cache()
-    if not quiet and (folder is None or not folder.is_dir() or not any(folder.iterdir())):
-        say("striptools: compiling the tracer, this takes some seconds\n", error=True)
+    kept = folder is not None and folder.is_dir() and any(folder.iterdir())
+    if not quiet and not (kept and _is_compiled("wide")):
+        say("striptools: compiling the tracer; this takes a while\n", error=True)
 
 
 def kernel_caches() -> dict[str, tuple[Path, int]]:
-    """Where each kernel module keeps its compiled code, and how many files lie there for this Python.
+    """Where each kernel module keeps its compiled code, and how many of its functions lie there up to date.
 
     Numba falls back to a folder of the user where the package's own cannot be written, so it is asked itself.
     """
@@ -35,10 +37,8 @@ def kernel_caches() -> dict[str, tuple[Path, int]]:
     for module in iter_modules(striptools.kernels.__path__, "striptools.kernels."):
         folder = _cache_folder(module.name)
         if folder is not None:
-            pattern = (
-                f"{module.name.rpartition('.')[2]}.*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
-            )
-            found[module.name] = (folder, sum(1 for _ in folder.glob(pattern)))
+            source = Path(str(import_module(module.name).__file__))
+            found[module.name] = (folder, _fresh_files(folder, source))
     return found
 
 
@@ -47,6 +47,17 @@ def tracer_cache() -> Path | None:
     jax = sys.modules.get("jax")
     folder = getattr(getattr(jax, "config", None), "jax_compilation_cache_dir", None)
     return Path(folder) if folder else None
+
+
+def _is_compiled(module: str) -> bool:
+    found = kernel_caches().get(f"striptools.kernels.{module}")
+    return found is not None and found[1] > 0
+
+
+def _fresh_files(folder: Path, source: Path) -> int:
+    changed = source.stat().st_mtime
+    files = folder.glob(f"{source.stem}.*{_PYTHON}*.nbi")
+    return sum(1 for file in files if file.stat().st_mtime >= changed)
 
 
 def _cache_folder(module: str) -> Path | None:
