@@ -421,6 +421,24 @@ def test_verify_proves_a_scene(run, folder: Path) -> None:
     assert facts["max_t_error"] >= 0.0
 
 
+def test_verify_in_the_other_formats(run, folder: Path) -> None:
+    few = (
+        "verify",
+        folder / "torus.rdm",
+        "--against",
+        folder / "torus.ply",
+        "--rays",
+        30,
+        "--aimed-rays",
+        100,
+    )
+    rows = dict(csv.reader(io.StringIO(run(*few, "--format", "csv")[1])))
+    assert (rows["ok"], rows["disagreements"], rows["sets.camera.rays"]) == ("true", "0", "30")
+    assert "| leaks | 0 |\n" in run(*few, "--format", "md")[1]
+    assert run(*few)[1].startswith("torus.rdm against torus.ply: proved, ")
+    assert run(*few, "--quiet") == (0, "", "")
+
+
 def test_verify_exits_1_on_another_model(run, folder: Path, tmp_path: Path) -> None:
     mesh = striptools.load_mesh(folder / "torus.ply")
     other = striptools.Mesh(np.ascontiguousarray(mesh.positions * np.float32(1.01)), mesh.faces)
@@ -534,7 +552,7 @@ def test_without_jax_only_tracing_is_missing(folder: Path, tmp_path: Path, verb:
         "verify": ["torus.rdm", "--against", "torus.ply"],
         "render": ["torus.rdm", str(tmp_path / "x.png")],
     }
-    script = "import sys; sys.modules['jax'] = None; from striptools_cli.app import main; sys.exit(main(sys.argv[1:]))"
+    script = "import sys; sys.modules['jax'] = None; from striptools_cli.app import main; sys.exit(main())"
     command = [sys.executable, "-c", script, verb, *rest[verb]]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == code
