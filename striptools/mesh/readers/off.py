@@ -23,7 +23,7 @@ from striptools.mesh.readers.parsed import (
     strict_numbers,
 )
 
-KEYWORD = re.compile(rb"(ST)?(C)?(N)?OFF\b", re.IGNORECASE)
+KEYWORD = re.compile(rb"(ST)?(CN?|NC?)?OFF\b", re.IGNORECASE)
 
 
 def read_off(file: IO[bytes]) -> Parsed:
