@@ -50,7 +50,8 @@ class SetResult:
         disagreements: Rays with a wrong answer, leaks apart.
         leaks: Rays that slipped through where a hit was certain.
         max_t_error: The largest |t - t of the reported face|, in t's unit.
-        max_t_ratio: The largest such error in parts of its bound.
+        max_t_ratio: The largest such error in parts of its bound; near 1 only for faces seen edge-on, where t
+            may lie anywhere in the face.
         max_uv_error: The largest distance between the ray and the point of u and v, in the model's unit.
         max_uv_ratio: The largest such distance in parts of its bound.
         flaws: The first few flaws in words.
