@@ -46,6 +46,7 @@ class TestCamera:
         frame = np.stack([camera.right, camera.up, camera.forward])
         assert np.allclose(frame @ frame.T, np.eye(3))
         assert np.linalg.det(frame) == pytest.approx(-1)
+        assert place.max(axis=0) == pytest.approx(-place.min(axis=0), abs=1e-6)
         if fov < 60:
             assert np.abs(place).max() == pytest.approx(0.88, abs=1e-6)
 

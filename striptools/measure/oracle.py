@@ -81,8 +81,10 @@ class Oracle:
         self._finite_face = np.flatnonzero(np.all(finite[mesh.faces], axis=1)).astype(np.int32)
         self.faces = np.asarray(mesh.faces)
         kept = self.faces[self._finite_face]
-        used, corner = np.unique(kept, return_inverse=True)
-        self._corner = np.ascontiguousarray(corner.reshape(-1, 3).T.astype(np.intp))
+        used = np.zeros(len(self.positions), bool)
+        used[kept] = True
+        number = np.cumsum(used) - 1
+        self._corner = np.ascontiguousarray(number[kept].T.astype(np.intp))
         points = self.positions[used]
         self._low = points.min(axis=0) if len(points) else np.zeros(3)
         self._high = points.max(axis=0) if len(points) else np.zeros(3)

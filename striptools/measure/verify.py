@@ -6,7 +6,6 @@ check: `structure`. Cost: rays x faces pairs for the rays that every face is tri
 100,000 faces), microseconds for each further aimed ray.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -21,9 +20,8 @@ from striptools.measure.structure import Structure, compare_structure, rounded_p
 from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
 from striptools.reducem.scene import Scene
+from striptools.stopwatch import Watch
 from striptools.trace.hit import Hits
-
-Watch = Callable[[str, float], None]
 
 
 class Traces(Protocol):
@@ -225,8 +223,10 @@ def _traced_faces(scene: Scene, source: Mesh) -> np.ndarray:
     """The source faces that the scene holds; all that cleaning keeps where it does not say."""
     if scene.remap is None:
         return clean(source).source_face
-    face = np.unique(scene.remap.face)
-    return face[(face >= 0) & (face < source.triangle_count)].astype(np.int32)
+    there = np.zeros(source.triangle_count, bool)
+    face = scene.remap.face
+    there[face[(face >= 0) & (face < source.triangle_count)]] = True
+    return np.flatnonzero(there).astype(np.int32)
 
 
 class _Runner:

@@ -13,6 +13,7 @@ from striptools.errors import UsageError
 from striptools.types import RayVectors
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+CENTRING_STEPS = 12
 UP_CHOICES = ("x", "y", "z", "-x", "-y", "-z")
 THREE_QUARTER = (0.55, 0.38, 1.0)
 """The default place of the eye, as right, up and front parts: the front, a little to the right and above."""
@@ -105,7 +106,7 @@ def _eye_before(seen: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """The eye nearest to points in camera axes that holds them all within `spread` (tangents across and up).
 
     A point is held across where |x - x_eye| <= s (z - z_eye): the largest of x - s z and the smallest of x +
-    s z are all that matters. The axis that needs more room sets the distance; on the other the eye is
+    s z are all that matters. The axis that needs more room sets the distance; on each the picture is
     centred.
     """
     side = seen[:, :2]
@@ -116,7 +117,23 @@ def _eye_before(seen: np.ndarray, spread: np.ndarray) -> np.ndarray:
     nearest = float(seen[:, 2].min())
     size = float(np.abs(seen).max())
     depth = min(depth, nearest - max(0.05 * size, 1e-30))
-    return np.array([*((greatest + least) / 2), depth])
+    return np.array([*(_centred(side[:, axis], seen[:, 2] - depth) for axis in range(2)), depth])
+
+
+def _centred(side: np.ndarray, ahead: np.ndarray) -> float:
+    """The eye's place across from which points at depths `ahead` reach as far to one side as to the other.
+
+    Exchange: solve for the two outermost points, look which are outermost then, until they stay.
+    """
+    eye = 0.0
+    for _ in range(CENTRING_STEPS):
+        seen = (side - eye) / ahead
+        low, high = int(np.argmin(seen)), int(np.argmax(seen))
+        better = (side[low] * ahead[high] + side[high] * ahead[low]) / (ahead[low] + ahead[high])
+        if better == eye:
+            break
+        eye = float(better)
+    return eye
 
 
 def camera_rays(camera: Camera, samples: int = 1) -> tuple[RayVectors, RayVectors]:

@@ -90,7 +90,7 @@ def tell(name: str, place: str, report: VerifyReport, seconds: float) -> None:
     for part in report.sets:
         lines.append(
             f"    {part.name}: {part.rays} rays, {part.hits} hit, {part.certain} certain, "
-            f"{part.leaks} leaks, {part.disagreements} disagreements, errors of t {part.max_t_ratio:.2f} and of u, v "
+            f"{part.leaks} leaks, {part.disagreements} disagreements, t {part.max_t_ratio:.2f} and u, v "
             f"{part.max_uv_ratio:.2f} of their bounds"
         )
     sys.stdout.writelines(f"{line}\n" for line in lines)
