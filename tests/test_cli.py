@@ -396,7 +396,7 @@ def test_info_has_the_names_that_programs_rely_on(run, folder: Path) -> None:
     assert facts["strips"] == scene.strip_count
     assert facts["vertices_per_triangle"] == pytest.approx(1 + 2 * scene.strip_count / 576)
     assert facts["format_version"] == "0.1"
-    assert facts["precision"] == {"kind": "float32", "bits": 32, "error_bound": 0.0, "lossless": True}
+    assert facts["precision"] == {"kind": "lossless", "bits": 32, "error_bound": 0.0}
     parts = facts["bytes"]
     total = parts.pop("total")
     assert total == sum(parts.values()) == (folder / "torus.rdm").stat().st_size

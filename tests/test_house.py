@@ -11,7 +11,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOLS = Path(sys.executable).parent
-IMPORT_LIMIT = 0.5
 HEAVY = ("jax", "jaxlib", "numba", "llvmlite", "trimesh", "scipy", "networkx")
 FOREIGN = re.compile(
     r"(?<![\w.])/(home|root|Users|work|tmp|var|mnt|media)/[\w.]"  # a place on one machine
@@ -56,18 +55,10 @@ def test_import_contracts() -> None:
     run_tool("lint-imports")
 
 
-def test_import_is_fast_and_light() -> None:
-    script = (
-        "import json, sys, time; start = time.perf_counter(); import striptools; "
-        "seconds = time.perf_counter() - start; print(json.dumps([seconds, sorted(sys.modules)]))"
-    )
-    runs = []
-    for _ in range(3):
-        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-        runs.append(json.loads(done.stdout))
-    assert not {module for _, modules in runs for module in modules} & set(HEAVY)
-    # A busy machine only ever adds time, so the best of the runs is the measure.
-    assert min(seconds for seconds, _ in runs) < IMPORT_LIMIT
+def test_import_is_light() -> None:
+    script = "import json, sys, striptools; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert not set(json.loads(done.stdout)) & set(HEAVY)
 
 
 def test_conversion_needs_no_jax() -> None:

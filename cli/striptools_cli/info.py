@@ -29,7 +29,6 @@ def run(
 def describe(scene: Scene) -> dict[str, object]:
     """The facts of a scene, by the names that other programs rely on."""
     triangles = scene.triangle_count
-    exact = scene.error_bound == 0.0
     bounds = [[float(corner) for corner in row] for row in (scene.positions.min(0), scene.positions.max(0))]
     return {
         "triangles": triangles,
@@ -41,10 +40,9 @@ def describe(scene: Scene) -> dict[str, object]:
         "bytes_per_triangle": scene.bytes_per_triangle(),
         "bytes": {**scene.part_bytes(), "total": sum(scene.part_bytes().values())},
         "precision": {
-            "kind": "float32",
+            "kind": "lossless" if scene.error_bound == 0.0 else "welded",
             "bits": 32,
             "error_bound": scene.error_bound,
-            "lossless": exact,
         },
         "format_version": f"{VERSION[0]}.{VERSION[1]}",
         "remap": scene.remap is not None,

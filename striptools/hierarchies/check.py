@@ -38,7 +38,7 @@ def strip_hierarchy_flaw(hierarchy: StripHierarchy, strip_boxes: Boxes) -> tuple
     first, count, broken = strip_ranges(left, strips)
     if broken >= 0:
         return EMPTY_CHILD, int(broken)
-    node = _first(~np.isfinite(hierarchy.boxes).all(axis=1))
+    node = _first(np.logical_not(np.isfinite(hierarchy.boxes).all(axis=1)))
     if node >= 0:
         return NOT_FINITE, node
     places, lefts = np.arange(strips - 1), left.astype(np.int64)
@@ -105,7 +105,8 @@ def _spills(
 
 def _holds(outer: Boxes, inner: Boxes) -> Bools:
     # Written so that a comparison with NaN says no.
-    return ((outer[:, :3] <= inner[:, :3]) & (outer[:, 3:] >= inner[:, 3:])).all(axis=1)
+    held = (outer[:, :3] <= inner[:, :3]) & (outer[:, 3:] >= inner[:, 3:])
+    return np.logical_and.reduce(held, axis=1)
 
 
 def _first(flags: Bools) -> int:

@@ -1,1 +1,1 @@
-
+"""All Numba code: arrays in, arrays out, no Python objects."""

@@ -48,15 +48,16 @@ def read_through_meshlab(file: IO[bytes], path: Path | None, file_format: str) -
             remedy="pip install 'striptools[meshlab]', or convert the file to PLY, OBJ, STL or GLB",
         ) from error
     if path is not None:
-        return _flat(pymeshlab.MeshSet(), path)
+        return _flat(pymeshlab, path)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / f"input.{file_format}"
         with copy.open("wb") as out:
             shutil.copyfileobj(file, out)
-        return _flat(pymeshlab.MeshSet(), copy)
+        return _flat(pymeshlab, copy)
 
 
-def _flat(meshes: Any, path: Path) -> Parsed:
+def _flat(pymeshlab: Any, path: Path) -> Parsed:
+    meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(path))
     parts = []
     for mesh in meshes:
