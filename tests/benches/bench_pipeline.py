@@ -2,9 +2,9 @@
 
     python tests/benches/bench_pipeline.py FOLDER [MESH ...] [--record]
 
-FOLDER holds `MESH.ply` files. Each model has a process of its own. There a small mesh is converted first, which
-brings in all imports and compiled kernels; the first conversion of the model then gives the peak of memory and
-the second one the seconds.
+FOLDER holds `MESH.ply` files. Each model has a process of its own. There a small mesh is converted first,
+which brings in all imports and compiled kernels; the first conversion of the model then gives the peak of
+memory, and the second one the seconds.
 `--record` appends the figures to `results.csv`.
 """
 
