@@ -128,3 +128,10 @@ class TestCosineRays:
 
     def test_no_points(self) -> None:
         assert cosine_rays(np.zeros((0, 3)), np.zeros((0, 3)))[0].shape == (0, 3)
+
+
+def test_what_float32_cannot_hold_becomes_infinite_and_misses() -> None:
+    corners = np.array([[0, 0, 0], [3e38, 3e38, 3e38]])
+    origins, directions = camera_rays(Camera.framing(corners, width=2, height=2))
+    assert np.isinf(origins).any()
+    assert np.isfinite(directions).all()

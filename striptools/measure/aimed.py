@@ -25,6 +25,7 @@ import numpy as np
 
 from striptools.measure.bound import RayFrames, judge_pairs
 from striptools.mesh.clean import weld_vertices
+from striptools.trace.rays import to_float32
 
 PAIRS_A_CHUNK = 1 << 18
 
@@ -220,14 +221,13 @@ def aim(
     origins = np.where(
         (kind == 0)[:, None], around[random.integers(0, 64, count)], targets + side * slanted * reach
     )
-    with np.errstate(over="ignore"):
-        origins, aims = origins.astype(np.float32), targets.astype(np.float32)
+    origins, aims = to_float32(origins), to_float32(targets)
     axis = random.integers(0, 3, count)
     rows = np.flatnonzero(kind == 3)
     origins[rows] = aims[rows]
     outwards = np.where(normals[rows, axis[rows]] < 0, -1, 1) * 1.5 * diagonal
-    origins[rows, axis[rows]] = (targets[rows, axis[rows]] + outwards).astype(np.float32)
-    directions = (targets - origins.astype(np.float64)).astype(np.float32)
+    origins[rows, axis[rows]] = to_float32(targets[rows, axis[rows]] + outwards)
+    directions = to_float32(targets - origins.astype(np.float64))
     straight = np.zeros((len(rows), 3), np.float32)
     straight[np.arange(len(rows)), axis[rows]] = -np.sign(outwards)
     directions[rows] = straight

@@ -6,7 +6,7 @@ import numpy as np
 
 from striptools.measure.aimed import Fans, Surface, aim
 from striptools.measure.oracle import Oracle, OracleHits
-from striptools.trace.rays import Camera, camera_rays, cosine_rays
+from striptools.trace.rays import Camera, camera_rays, cosine_rays, to_float32
 from striptools.types import RayVectors
 
 VIEWS = ((0.55, 0.38, 1.0), (-1.0, 0.25, -0.6), (0.2, -0.9, 0.4))
@@ -121,7 +121,7 @@ def inside_sets(
 
 
 def _towards(targets: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    return (targets - origins.astype(np.float64)).astype(np.float32)
+    return to_float32(targets - origins.astype(np.float64))
 
 
 def find_inside(oracle: Oracle, camera: RaySet, hits: OracleHits) -> np.ndarray:
@@ -140,7 +140,7 @@ def find_inside(oracle: Oracle, camera: RaySet, hits: OracleHits) -> np.ndarray:
     gap = t[first + 1] - t[first]
     widest = first[np.argsort(-gap, kind="stable")[:INSIDE_PLACES]]
     chosen, middle = ray[widest], (t[widest] + t[widest + 1]) / 2
-    places = (camera.origins[chosen] + middle[:, None] * camera.directions[chosen]).astype(np.float32)
+    places = to_float32(camera.origins[chosen] + middle[:, None] * camera.directions[chosen])
     found = oracle.closest_hit(places, camera.directions[chosen]).candidates
     winding = np.bincount(found.ray, weights=found.pairs.side, minlength=len(places))
     doubt = np.bincount(found.ray, weights=~found.pairs.certain, minlength=len(places))

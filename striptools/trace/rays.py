@@ -159,7 +159,7 @@ def camera_rays(camera: Camera, samples: int = 1) -> tuple[RayVectors, RayVector
     upward = y[:, None, :, None, None] * camera.up
     directions = (camera.forward + across + upward).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.broadcast_to(camera.eye.astype(np.float32), directions.shape)
+    origins = np.broadcast_to(to_float32(camera.eye), directions.shape)
     return np.ascontiguousarray(origins), directions.astype(np.float32)
 
 
@@ -200,7 +200,13 @@ def cosine_rays(
         + bitangent * (radius * np.sin(angle))[:, None]
         + normals * height[:, None]
     )
-    return (points + normals * lift[:, None]).astype(np.float32), directions.astype(np.float32)
+    return to_float32(points + normals * lift[:, None]), directions.astype(np.float32)
+
+
+def to_float32(values: np.ndarray) -> np.ndarray:
+    """Round to float32; what is too large becomes infinite, and its ray a miss."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
 
 
 def _tangent_frame(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
