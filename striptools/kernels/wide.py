@@ -250,7 +250,7 @@ def fill_leaf_blocks(
         scale: float32 power of two that positions are multiplied by.
         leaf_first: (l,) int32.
         leaf_count: (l,) int32.
-        blocks: (>= l, 10, 8) float32, written: corner a xyz, b xyz, c xyz; other lanes untouched.
+        blocks: (>= l, 10, 8) float32, written: x of corners a, b, c, then y, then z; other lanes untouched.
         block_bits: The same memory as int32; row 9 is written: the reported faces.
         place: (>= max(ids) + 1,) int32, written: `(leaf * 8 + lane) * 4 + turn` of each face, where
             canonical corner j is the reported face's corner (j + turn) % 3.
@@ -265,6 +265,6 @@ def fill_leaf_blocks(
             for j in range(3):
                 corner = faces[t, (j + turn) % 3]
                 for axis in range(3):
-                    blocks[q, 3 * j + axis, lane] = positions[corner, axis] * scale
+                    blocks[q, 3 * axis + j, lane] = positions[corner, axis] * scale
             block_bits[q, 9, lane] = ids[t]
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3

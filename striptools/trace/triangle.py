@@ -28,8 +28,8 @@ from jax import Array, lax
 
 from striptools.trace.numerics import SIGN, rounded, with_sign_of
 
-CornerLoader = Callable[[int, Array], Array]
-"""Gives coordinate `axis` (uint32) of corner 0, 1 or 2: of one triangle, or of the lanes of a leaf."""
+CornerLoader = Callable[[Array], Array]
+"""Gives coordinate `axis` (uint32) of the three corners: (3,) of one triangle or (3, 8) of a leaf's lanes."""
 
 
 class Shear(NamedTuple):
@@ -48,14 +48,7 @@ class Edges(NamedTuple):
     a: Array
     b: Array
     c: Array
-    heights: tuple[Array, Array, Array]
-
-
-class Crossing(NamedTuple):
-    """Where the line of a ray meets a triangle's plane: `t` means something only where `inside`."""
-
-    inside: Array
-    t: Array
+    heights: Array
 
 
 def shear_of(origin: Array, direction: Array) -> Shear:
@@ -81,33 +74,28 @@ def pick(vector: Array, axis: Array) -> Array:
     return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
 
-def edges_of(corner: CornerLoader, shear: Shear) -> Edges:
+def edges_of(corners: CornerLoader, shear: Shear) -> Edges:
     """Edge functions of one triangle or of a block of them."""
-    kx, ky, kz = shear.axes
-    ox, oy, oz = shear.origin
-    sheared = []
-    heights = []
-    for k in range(3):
-        z = corner(k, kz) - oz
-        sheared.append((corner(k, kx) - ox - rounded(shear.x * z), corner(k, ky) - oy - rounded(shear.y * z)))
-        heights.append(rounded(z * shear.z))
-    (ax, ay), (bx, by), (cx, cy) = sheared
+    x, y, z = (corners(axis) - start for axis, start in zip(shear.axes, shear.origin, strict=True))
+    ax, bx, cx = x - rounded(shear.x * z)
+    ay, by, cy = y - rounded(shear.y * z)
     return Edges(
         rounded(cx * by) - rounded(cy * bx),
         rounded(ax * cy) - rounded(ay * cx),
         rounded(bx * ay) - rounded(by * ax),
-        (heights[0], heights[1], heights[2]),
+        rounded(z * shear.z),
     )
 
 
-def crossing_of(edges: Edges) -> Crossing:
-    """Whether a ray's line goes through, and where along it."""
+def crossing_of(edges: Edges) -> Array:
+    """Where along a ray its line goes through each triangle: positive and finite only where it does.
+
+    The division comes last on purpose: XLA computes a division once, all that is cheap again for each use.
+    """
     a, b, c, heights = edges
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     determinant = a + b + c
     scaled_t = rounded(a * heights[0]) + rounded(b * heights[1]) + rounded(c * heights[2])
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
-    size = with_sign_of(determinant, sign)
-    # The barrier keeps XLA from computing the whole test again for the second user of t.
-    t = lax.optimization_barrier(with_sign_of(scaled_t, sign) / size)
-    return Crossing(inside & (size > 0), t)
+    scaled_t = with_sign_of(jnp.where(inside, scaled_t, jnp.inf), sign)
+    return lax.optimization_barrier(scaled_t / with_sign_of(determinant, sign))

@@ -50,8 +50,8 @@ class WideScene(NamedTuple):
     Attributes:
         boxes: (w, 6, 8) float32, NaN in empty lanes.
         child: (8 w + 16,) int32, as in `WideTree`, then `DONE`.
-        blocks: (l, 10, 8) float32, corner a xyz, b xyz, c xyz of each leaf's triangles by lane, NaN in empty
-            lanes, then the bits of their faces (int32): a leaf is 320 bytes in a row.
+        blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
+            NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
         place: (f,) int32, of each face: (leaf * 8 + lane) * 4 + turn, see `kernels.wide.fill_leaf_blocks`.
         scale: () float32, the power of two that positions were multiplied by.
         reach: () float32, the largest scaled coordinate.
@@ -145,9 +145,9 @@ class _Place(NamedTuple):
 
 
 class _Best(NamedTuple):
-    """The closest hit in each lane, and the distance beyond which boxes do not matter."""
+    """The closest hit in each lane, and the closest of all, or t_max."""
 
-    limit: Array
+    nearest: Array
     t: Array
     face: Array
 
@@ -241,40 +241,33 @@ def _visit_node(
     return _Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
-def _visit_leaf(scene: WideScene, ray: _Ray, child: Array, best: _Best, any_hit: bool) -> _Best:
+def _visit_leaf(scene: WideScene, ray: _Ray, child: Array, best: _Best) -> _Best:
     """Test the triangles of a leaf, each lane against its own closest hit."""
     leaf = index(-(child + 1))
 
-    def corner(k: int, axis: Array) -> Array:
-        return lax.dynamic_slice(
-            scene.blocks, (leaf, axis + jnp.uint32(3 * k), jnp.uint32(0)), (1, 1, WIDTH)
-        )[0, 0]
+    def corners(axis: Array) -> Array:
+        return lax.dynamic_slice(scene.blocks, (leaf, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
 
-    inside, t = crossing_of(edges_of(corner, ray.shear))
+    t = crossing_of(edges_of(corners, ray.shear))
     bits = lax.dynamic_slice(scene.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
     face = lax.bitcast_convert_type(bits, jnp.int32)
-    closer = inside & (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.face)))
+    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.face)))
     t = jnp.where(closer, t, best.t)
     face = jnp.where(closer, face, best.face)
-    if any_hit:
-        limit = jnp.where(jnp.sum(closer.astype(jnp.int32)) != 0, jnp.float32(-1), best.limit)
-        return _Best(limit, t, face)
     nearest = t
     while len(nearest) > 1:
         half = len(nearest) // 2
         nearest = smaller(nearest[:half], nearest[half:])
-    return _Best(nearest[0] * SLACK, t, face)
+    return _Best(nearest[0], t, face)
 
 
-def _closest_lane(best: _Best) -> tuple[Array, Array]:
-    """Least t, then least face, over the lanes."""
-    t, face = best.t, jnp.where(best.face < 0, NO_FACE, best.face)
-    while len(t) > 1:
-        half = len(t) // 2
-        first = (t[:half] < t[half:]) | ((t[:half] == t[half:]) & (face[:half] < face[half:]))
-        t = jnp.where(first, t[:half], t[half:])
-        face = jnp.where(first, face[:half], face[half:])
-    return t[0], jnp.where(face[0] == NO_FACE, MISS, face[0])
+def _closest_face(best: _Best) -> Array:
+    """The least face of the lanes that hold the closest hit; `MISS` where none does."""
+    face = jnp.where((best.t == best.nearest) & (best.face >= 0), best.face, NO_FACE)
+    while len(face) > 1:
+        half = len(face) // 2
+        face = smaller(face[:half], face[half:])
+    return jnp.where(face[0] == NO_FACE, MISS, face[0])
 
 
 def weights_of(scene: WideScene, origins: Array, directions: Array, face: Array) -> tuple[Array, Array]:
@@ -290,10 +283,7 @@ def weights_of(scene: WideScene, origins: Array, directions: Array, face: Array)
     def one(origin: Array, direction: Array, corners: Array) -> Edges:
         shear = shear_of(origin * scene.scale, direction)
 
-        def corner(k: int, axis: Array) -> Array:
-            return pick(corners[k], axis)
-
-        return edges_of(corner, shear)
+        return edges_of(lambda axis: pick(corners, axis), shear)
 
     a, b, c, _ = jax.vmap(one)(origins, directions, corners)
     whole = a + b + c
@@ -340,7 +330,9 @@ class _Walk:
         """Each ray that is at an inner node visits it."""
         visits = [
             _visit_node(self.scene, *each)
-            for each in zip(self.rays, state.places, [b.limit for b in bests], state.stacks, strict=True)
+            for each in zip(
+                self.rays, state.places, [best.nearest * SLACK for best in bests], state.stacks, strict=True
+            )
         ]
         places, stacks = tuple(v[0] for v in visits), tuple(v[1] for v in visits)
         at_node = [place.child >= 0 for place in state.places]
@@ -363,10 +355,10 @@ class _Walk:
     def leave_leaf(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
-        best = _visit_leaf(self.scene, ray, place.child, best, self.options.any_hit)
+        best = _visit_leaf(self.scene, ray, place.child, best)
         there = _next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
-            there = there._replace(child=jnp.where(best.limit < 0, DONE, there.child))
+            there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
         return there, best
 
     def stay(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
@@ -390,7 +382,7 @@ def _walk_group(
     zero = jnp.int32(0)
     places = tuple(_Place(jnp.where(ray.valid, zero, DONE), zero, zero, jnp.int32(1)) for ray in rays)
     bests = tuple(
-        _Best(ray.t_max * SLACK, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
+        _Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
     )
     steps = (zero,) * len(rays) if options.count_steps else ()
 
@@ -415,6 +407,6 @@ def _walk_group(
 
 def _result(ray: _Ray, place: _Place, best: _Best) -> tuple[Array, Array]:
     """What is reported of a ray: t in the caller's units, and the face."""
-    t, face = _closest_lane(best)
-    t = jnp.where(face < 0, jnp.float32(jnp.inf), t * ray.t_unit)
+    face = _closest_face(best)
+    t = jnp.where(face < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
     return t, jnp.where(place.child != DONE, STUCK, face)

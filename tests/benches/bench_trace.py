@@ -1,0 +1,157 @@
+"""Tracing against embreex in the same run, one thread each: camera rays and ambient occlusion rays.
+
+    python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--record] [--note TEXT]
+
+MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
+occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
+any hit. The two tracers take turns; a ratio is the median of the ratios of runs next to each other in time.
+"""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from embreex import rtcore, rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from results import Row, append
+
+import striptools
+from striptools.reducem.scene import Scene
+from striptools.trace import Tracer
+from striptools.trace.rays import Camera, camera_rays, cosine_rays
+
+PIXELS = 1024
+TILE = 8
+FAR = np.float32(1e37)
+
+Rays = tuple[np.ndarray, np.ndarray]
+
+
+class Embree:
+    """The peer: embreex as it comes, its default scene, through its Python interface."""
+
+    def __init__(self, corners: np.ndarray) -> None:
+        self.device = rtcore.EmbreeDevice()
+        self.scene = rtcore_scene.EmbreeScene(self.device)
+        self.mesh = TriangleMesh(self.scene, corners)
+        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The face that each ray hits first, -1 for none."""
+        far = np.full(len(origins), FAR)
+        return self.scene.run(origins, directions, dists=far, query="INTERSECT")
+
+    def any(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether each ray hits anything."""
+        far = np.full(len(origins), FAR)
+        return self.scene.run(origins, directions, dists=far, query="OCCLUDED") == 0
+
+
+def main() -> int:
+    """Measure each model and print a row for each kind of ray."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("models", nargs="+", type=Path)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--record", action="store_true")
+    parser.add_argument("--note", default="")
+    arguments = parser.parse_args()
+    for path in arguments.models:
+        scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
+        rows = measure(path.stem, scene, arguments.repeats, arguments.note)
+        for row in rows:
+            peer = f", {row.peer} {row.peer_value:.3g}, ratio {row.ratio:.3f}" if row.peer_value else ""
+            sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.3g} {row.unit}{peer} {row.note}\n")
+            sys.stdout.flush()
+        if arguments.record:
+            append(rows)
+    return 0
+
+
+def measure(name: str, scene: Scene, repeats: int, note: str) -> list[Row]:
+    """Build both tracers, then let them take turns on each kind of ray."""
+    Tracer(scene, device="cpu", threads=1)
+    start = time.perf_counter()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    build = time.perf_counter() - start
+    corners = scene.positions[scene.faces()]
+    start = time.perf_counter()
+    peer = Embree(corners)
+    peer_build = time.perf_counter() - start
+    count = scene.triangle_count
+    rows = [Row("trace", name, count, "tracer build", build, "s", "embreex", peer_build, build / peer_build)]
+    camera = tiled_camera_rays(scene)
+    occlusion = occlusion_rays(corners, camera, peer.closest(*camera))
+    calls: list[tuple[str, Rays, Callable, Callable]] = [
+        ("camera rays, closest hit", camera, lambda *r: tracer.closest_hit(*r).triangle, peer.closest),
+        ("AO rays, closest hit", occlusion, lambda *r: tracer.closest_hit(*r).triangle, peer.closest),
+        ("AO rays, any hit", occlusion, tracer.any_hit, peer.any),
+    ]
+    for metric, rays, ours, theirs in calls:
+        rows.append(_compare(name, count, metric, rays, ours, theirs, repeats, note))
+    return rows
+
+
+def _compare(
+    name: str,
+    triangles: int,
+    metric: str,
+    rays: Rays,
+    ours: Callable,
+    theirs: Callable,
+    repeats: int,
+    note: str,
+) -> Row:
+    """Take turns; millions of rays a second of each, and the median ratio."""
+    same = float((ours(*rays) == theirs(*rays)).mean())
+    times = [(_seconds(theirs, rays), _seconds(ours, rays)) for _ in range(repeats)]
+    count = len(rays[0])
+    rate, peer_rate = (
+        count / min(column) / 1e6 for column in (list(zip(*times, strict=True))[k] for k in (1, 0))
+    )
+    ratio = statistics.median(peer / mine for peer, mine in times)
+    remark = "; ".join(filter(None, [f"{count} rays, one thread, same answer {same:.6f}", note]))
+    return Row("trace", name, triangles, metric, rate, "Mray/s", "embreex", peer_rate, ratio, remark)
+
+
+def _seconds(call: Callable, rays: Rays) -> float:
+    start = time.perf_counter()
+    call(*rays)
+    return time.perf_counter() - start
+
+
+def tiled_camera_rays(scene: Scene) -> Rays:
+    """Rays of a picture of the whole model, tile by tile."""
+    camera = Camera.framing(scene.positions, width=PIXELS, height=PIXELS)
+    tiles = PIXELS // TILE
+    return tuple(
+        np.ascontiguousarray(
+            rays.reshape(tiles, TILE, tiles, TILE, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
+        )
+        for rays in camera_rays(camera)
+    )
+
+
+def occlusion_rays(corners: np.ndarray, rays: Rays, triangle: np.ndarray) -> Rays:
+    """One ray from each point seen, to the side it is seen from."""
+    hit = np.flatnonzero(triangle >= 0)
+    origin, direction = (a[hit].astype(np.float64) for a in rays)
+    a, b, c = (corners[triangle[hit], k].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    towards = (normal * direction).sum(axis=1, keepdims=True)
+    normal = np.where(towards > 0, -normal, normal)
+    depth = ((a - origin) * normal).sum(axis=1) / np.minimum((direction * normal).sum(axis=1), -1e-12)
+    size = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+    return cosine_rays(origin + depth[:, None] * direction, normal, offset=1e-4 * size)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
