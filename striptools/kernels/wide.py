@@ -6,6 +6,8 @@ from numba import njit
 WIDTH = 8
 """Children of a wide node and triangles of a leaf block: the float32 lanes of one AVX register."""
 
+LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
+
 EMPTY = np.int32(-(2**31))
 """The child of an empty lane."""
 
@@ -234,6 +236,12 @@ def comes_before(positions, a, b):
 
 
 @njit(cache=True, nogil=True)
+def flushed(value):
+    """Zero for a denormal float32, as XLA has it."""
+    return value if abs(value) >= LEAST_NORMAL else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True)
 def fill_leaf_blocks(
     positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_bits, place
 ):
@@ -265,6 +273,66 @@ def fill_leaf_blocks(
             for j in range(3):
                 corner = faces[t, (j + turn) % 3]
                 for axis in range(3):
-                    blocks[q, 3 * axis + j, lane] = positions[corner, axis] * scale
+                    blocks[q, 3 * axis + j, lane] = flushed(positions[corner, axis] * scale)
             block_bits[q, 9, lane] = ids[t]
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3
+
+
+@njit(cache=True, nogil=True)
+def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, v, triangle):
+    """Where on its face each hit lies: the watertight test's own edge functions, once, for the face hit.
+
+    Args:
+        origins: (r, 3) float32.
+        directions: (r, 3) float32, not zero where there is a hit.
+        face: (r,) int32, the reported face; negative on a miss.
+        place: (f,) int32, see `fill_leaf_blocks`.
+        blocks: (l, 10, 8) float32, see `fill_leaf_blocks`.
+        scale: float32, what positions in `blocks` were multiplied by.
+        triangle_of: (f,) int32, the triangle in file order of each face.
+        u: (r,) float32, written: the weight of the face's second corner.
+        v: (r,) float32, written: the weight of its third corner.
+        triangle: (r,) int32, written; -1 on a miss.
+    """
+    weights = np.zeros(3, np.float32)
+    x = np.zeros(3, np.float32)
+    y = np.zeros(3, np.float32)
+    for r in range(len(face)):
+        if face[r] < 0:
+            u[r] = 0.0
+            v[r] = 0.0
+            triangle[r] = -1
+            continue
+        triangle[r] = triangle_of[face[r]]
+        slot = place[face[r]]
+        leaf = slot >> 5
+        lane = (slot >> 2) & 7
+        turn = slot & 3
+
+        # Shear the corners so that the ray runs along its dominant axis.
+        size_x = abs(directions[r, 0])
+        size_y = abs(directions[r, 1])
+        size_z = abs(directions[r, 2])
+        kz = 0 if size_x >= size_y and size_x >= size_z else (1 if size_y >= size_z else 2)
+        kx = 0 if kz == 2 else kz + 1
+        ky = 0 if kx == 2 else kx + 1
+        slope_x = directions[r, kx] / directions[r, kz]
+        slope_y = directions[r, ky] / directions[r, kz]
+        for j in range(3):
+            z = flushed(blocks[leaf, 3 * kz + j, lane] - flushed(origins[r, kz] * scale))
+            near_x = flushed(blocks[leaf, 3 * kx + j, lane] - flushed(origins[r, kx] * scale))
+            near_y = flushed(blocks[leaf, 3 * ky + j, lane] - flushed(origins[r, ky] * scale))
+            x[j] = flushed(near_x - flushed(slope_x * z))
+            y[j] = flushed(near_y - flushed(slope_y * z))
+
+        # Weigh the corners, and name them as the reported face does.
+        a = flushed(flushed(x[2] * y[1]) - flushed(y[2] * x[1]))
+        b = flushed(flushed(x[0] * y[2]) - flushed(y[0] * x[2]))
+        c = flushed(flushed(x[1] * y[0]) - flushed(y[1] * x[0]))
+        whole = a + b + c
+        inverse = np.float32(1.0) / whole if whole != 0.0 else np.float32(0.0)
+        weights[turn] = a * inverse
+        weights[(turn + 1) % 3] = b * inverse
+        weights[(turn + 2) % 3] = c * inverse
+        u[r] = weights[1]
+        v[r] = weights[2]

@@ -25,12 +25,14 @@ class Layout:
 
     Attributes:
         arrays: For the device, as NumPy arrays.
+        place: (f,) int32, of each face: (leaf * 8 + lane) * 4 + turn, see `kernels.wide.fill_leaf_blocks`.
         triangle_of: (f,) int32, the triangle in file order of each face that hits report; -1 for faces not
             in the scene.
         depth: The most wide nodes on a way from the root down.
     """
 
     arrays: WideScene
+    place: Int32[np.ndarray, " f"]
     triangle_of: Int32[np.ndarray, " f"]
     depth: int
 
@@ -52,7 +54,7 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
     blocks = aligned_full((size_class(leaves), 10, WIDTH), np.nan)
     blocks[:, 9] = NO_FACE.view(np.float32)
     face_count = int(ids.max()) + 1
-    place = np.zeros(size_class(face_count), np.int32)
+    place = np.zeros(face_count, np.int32)
     fill_leaf_blocks(
         scene.positions,
         faces,
@@ -69,7 +71,7 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
     triangle_of[ids] = np.arange(len(ids), dtype=np.int32)
     boxes, child = _nodes(wide, scale)
     reach = np.float32(np.abs(scene.positions).max() * scale)
-    return Layout(WideScene(boxes, child, blocks, place, scale, reach), triangle_of, wide.depth)
+    return Layout(WideScene(boxes, child, blocks, scale, reach), place, triangle_of, wide.depth)
 
 
 def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from striptools.errors import StriptoolsError, UsageError
+from striptools.kernels.wide import weigh_hits
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.hit import Hits
 from striptools.trace.launch import device_mesh, replicate, stream
@@ -78,17 +79,23 @@ class Tracer:
         """
         rays = checked_rays(origins, directions, t_max)
         count = len(rays[0])
-        t = np.full(count, np.inf, np.float32)
-        face = np.full(count, -1, np.int32)
-        u, v = np.zeros(count, np.float32), np.zeros(count, np.float32)
+        t, u, v = (np.zeros(count, np.float32) for _ in range(3))
+        face, triangle = np.zeros(count, np.int32), np.zeros(count, np.int32)
         counted = np.zeros(count if steps else 0, np.int32)
         for part, traced in stream(self._scene, rays, self._mesh, self._options(any_hit=False, steps=steps)):
-            t[part], face[part], u[part], v[part] = traced[:4]
+            t[part], face[part] = traced[:2]
             if steps:
-                counted[part] = traced[4]
-        _check_ended(face)
-        triangle = np.where(face < 0, np.int32(-1), self._layout.triangle_of[face])
+                counted[part] = traced[2]
+            _check_ended(face[part])
+            self._weigh(rays[0][part], rays[1][part], face[part], u[part], v[part], triangle[part])
         return Hits(t, face, u, v, triangle, counted if steps else None)
+
+    def _weigh(self, *rays_and_results: np.ndarray) -> None:
+        """Fill in u, v and triangle on this side, while the devices are at the next rays."""
+        origins, directions, face, *results = rays_and_results
+        layout = self._layout
+        blocks, scale = layout.arrays.blocks, layout.arrays.scale
+        weigh_hits(origins, directions, face, layout.place, blocks, scale, layout.triangle_of, *results)
 
     def any_hit(
         self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None

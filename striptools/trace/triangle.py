@@ -99,3 +99,9 @@ def crossing_of(edges: Edges) -> Array:
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
     scaled_t = with_sign_of(jnp.where(inside, scaled_t, jnp.inf), sign)
     return lax.optimization_barrier(scaled_t / with_sign_of(determinant, sign))
+
+
+# Notes
+#
+# A triangle no larger than the rounding of its distance from the ray's origin collapses to points on a line: its
+# edge functions are noise, and rays that pass it by far may be taken to hit it. Only its box keeps them away.

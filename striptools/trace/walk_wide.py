@@ -30,7 +30,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met, slab_of
 from striptools.trace.numerics import index, larger, power_of_two_below, smaller
-from striptools.trace.triangle import Edges, Shear, crossing_of, edges_of, pick, shear_of
+from striptools.trace.triangle import Shear, crossing_of, edges_of, shear_of
 
 WIDTH = 8
 DONE = np.int32(-(2**31))
@@ -52,7 +52,6 @@ class WideScene(NamedTuple):
         child: (8 w + 16,) int32, as in `WideTree`, then `DONE`.
         blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
             NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
-        place: (f,) int32, of each face: (leaf * 8 + lane) * 4 + turn, see `kernels.wide.fill_leaf_blocks`.
         scale: () float32, the power of two that positions were multiplied by.
         reach: () float32, the largest scaled coordinate.
     """
@@ -60,7 +59,6 @@ class WideScene(NamedTuple):
     boxes: Any
     child: Any
     blocks: Any
-    place: Any
     scale: Any
     reach: Any
 
@@ -88,8 +86,6 @@ class Traced(NamedTuple):
 
     t: Array
     face: Array
-    u: Array
-    v: Array
     steps: Array
 
 
@@ -183,9 +179,8 @@ def trace_rays(
         walked = lax.scan(walk, stacks, (floats, ints))[1]
     t, face, steps = (a.reshape(-1) for a in walked)
     if options.any_hit:
-        nothing = jnp.zeros(0)
-        return Traced(nothing, face, nothing, nothing, nothing)
-    return Traced(t, face, *weights_of(scene, origins, directions, face), steps)
+        t = jnp.zeros(0)
+    return Traced(t, face, steps)
 
 
 def _prepare(scene: WideScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
@@ -268,30 +263,6 @@ def _closest_face(best: _Best) -> Array:
         half = len(face) // 2
         face = smaller(face[:half], face[half:])
     return jnp.where(face[0] == NO_FACE, MISS, face[0])
-
-
-def weights_of(scene: WideScene, origins: Array, directions: Array, face: Array) -> tuple[Array, Array]:
-    """The weights u and v of r hits, by the corners of the faces that are reported.
-
-    All rays at once, after the walk: a walk that carried u and v would be slower at every step.
-    """
-    hit = face >= 0
-    place = scene.place[index(jnp.where(hit, face, 0))]
-    corners = scene.blocks[index(place >> 5), :9, index((place >> 2) & 7)].reshape(-1, 3, 3)
-    turn = place & 3
-
-    def one(origin: Array, direction: Array, corners: Array) -> Edges:
-        shear = shear_of(origin * scene.scale, direction)
-
-        return edges_of(lambda axis: pick(corners, axis), shear)
-
-    a, b, c, _ = jax.vmap(one)(origins, directions, corners)
-    whole = a + b + c
-    whole = jnp.where(hit & (whole != 0), whole, jnp.inf)
-    a, b, c = a / whole, b / whole, c / whole
-    u = jnp.where(turn == 0, b, jnp.where(turn == 1, a, c))
-    v = jnp.where(turn == 0, c, jnp.where(turn == 1, b, a))
-    return jnp.where(hit, u, 0), jnp.where(hit, v, 0)
 
 
 class _Walked(NamedTuple):
@@ -410,3 +381,13 @@ def _result(ray: _Ray, place: _Place, best: _Best) -> tuple[Array, Array]:
     face = _closest_face(best)
     t = jnp.where(face < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
     return t, jnp.where(place.child != DONE, STUCK, face)
+
+
+# Notes
+#
+# Tried on the dragon's strip hierarchy, one thread, Zen 4, and lost (time against what stands here):
+# leaf test without lax.cond 1.09; four rays side by side 1.05 to 1.2, one 1.1; the node and its lanes always read
+# back from the stack, to have no branch on "is anything left" 1.1 to 1.2 (the branch lets the processor guess the
+# next node); u and v inside the walk 1.3; rays as (o, d) prepared inside the walk 1.05; boxes and leaves in huge
+# pages 1.0. The in-strip hierarchy split by SAH instead of halved lowers the expected cost by 3 %, a new SAH
+# hierarchy over the leaves by 10 %: neither is what the scene file holds.
