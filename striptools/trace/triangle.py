@@ -103,5 +103,6 @@ def crossing_of(edges: Edges) -> Array:
 
 # Notes
 #
-# A triangle no larger than the rounding of its distance from the ray's origin collapses to points on a line: its
-# edge functions are noise, and rays that pass it by far may be taken to hit it. Only its box keeps them away.
+# A triangle no larger than the rounding of its distance from the ray's origin collapses to points on a
+# line: its edge functions are noise, and rays that pass it by far may be taken to hit it. Only its box
+# keeps them away.

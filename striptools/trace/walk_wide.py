@@ -385,9 +385,9 @@ def _result(ray: _Ray, place: _Place, best: _Best) -> tuple[Array, Array]:
 
 # Notes
 #
-# Tried on the dragon's strip hierarchy, one thread, Zen 4, and lost (time against what stands here):
-# leaf test without lax.cond 1.09; four rays side by side 1.05 to 1.2, one 1.1; the node and its lanes always read
-# back from the stack, to have no branch on "is anything left" 1.1 to 1.2 (the branch lets the processor guess the
-# next node); u and v inside the walk 1.3; rays as (o, d) prepared inside the walk 1.05; boxes and leaves in huge
-# pages 1.0. The in-strip hierarchy split by SAH instead of halved lowers the expected cost by 3 %, a new SAH
-# hierarchy over the leaves by 10 %: neither is what the scene file holds.
+# Tried on the dragon's strip hierarchy, one thread, Zen 4, and lost (time against what stands here): leaf
+# test without lax.cond 1.09; four rays side by side 1.05 to 1.2, one 1.1; the node and its lanes always
+# read back from the stack, to have no branch on "is anything left" 1.1 to 1.2 (the branch lets the
+# processor guess the next node); u and v inside the walk 1.3; rays as (o, d) prepared inside the walk 1.05;
+# boxes and leaves in huge pages 1.0. The in-strip hierarchy split by SAH instead of halved lowers the
+# expected cost by 3 %, a new SAH hierarchy over the leaves by 10 %: neither is what the scene file holds.
