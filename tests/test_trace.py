@@ -452,9 +452,10 @@ def test_doubles_and_lists_are_taken(ball):
 def test_a_tree_that_goes_round_ends_and_is_told():
     tracer = Tracer(small_scene(), device="cpu", threads=1)
     layout = tracer._layout
-    child = layout.arrays.child.copy()
-    child[np.flatnonzero(child[:8] != DONE)] = 0
-    tracer._take(replace(layout, arrays=layout.arrays._replace(child=child)))
+    nodes = layout.arrays.nodes.copy()
+    children = nodes[0, 6].view(np.int32)
+    children[children != DONE] = 0
+    tracer._take(replace(layout, arrays=layout.arrays._replace(nodes=nodes)))
     origins, directions = aimed_rays(small_scene().positions, small_scene().faces(), 50, 0)
     with pytest.raises(StriptoolsError, match="did not end"):
         tracer.closest_hit(origins, directions)

@@ -11,6 +11,9 @@ Differences:
 2. A direction component that is zero, or too small to cross the scene, is replaced by a tiny one of the
    same sign: with the margin, a ray that runs exactly in a box's side meets the box, and there is no 0 *
    inf.
+4. (side - origin) * inverse is side * inverse - origin * inverse, one fused step a side. Rounding the second
+   product moves a side by at most u times the origin's coordinate, an eighth of the margin (where nothing is
+   fused, as much again for the first); the roundings of the rest are relative to the distance.
 3. minimum and maximum are comparisons and selects. Empty lanes hold NaN and are never met.
 """
 
@@ -33,7 +36,7 @@ TINY = np.float32(2**-60)
 
 
 class Slab(NamedTuple):
-    """its origin for low and for high sides, and inverse directions."""
+    """Origin times inverse direction, for low and for high sides, and the inverse direction."""
 
     low: Array
     high: Array
@@ -52,7 +55,7 @@ def slab_of(origin: Array, direction: Array, reach: Array) -> Slab:
     margin = MARGIN * larger(larger(size[0], size[1]), larger(size[2], reach))
     tiny = jnp.where(direction < 0, -TINY, TINY)
     inverse = 1 / jnp.where(jnp.abs(direction) < TINY, tiny, direction)
-    return Slab(origin + margin, origin - margin, inverse)
+    return Slab((origin + margin) * inverse, (origin - margin) * inverse, inverse)
 
 
 def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:
@@ -66,8 +69,8 @@ def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:
     entries = []
     exits = []
     for axis in range(3):
-        a = (boxes[axis] - slab.low[axis]) * slab.inverse[axis]
-        b = (boxes[axis + 3] - slab.high[axis]) * slab.inverse[axis]
+        a = boxes[axis] * slab.inverse[axis] - slab.low[axis]
+        b = boxes[axis + 3] * slab.inverse[axis] - slab.high[axis]
         entries.append(smaller(a, b))
         exits.append(larger(a, b))
     entry = larger(larger(entries[0], entries[1]), larger(entries[2], jnp.float32(0)))

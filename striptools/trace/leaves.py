@@ -69,9 +69,9 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
     )
     triangle_of = np.full(face_count, -1, np.int32)
     triangle_of[ids] = np.arange(len(ids), dtype=np.int32)
-    boxes, child = _nodes(wide, scale)
+    nodes = _nodes(wide, scale)
     reach = np.float32(np.abs(scene.positions).max() * scale)
-    return Layout(WideScene(boxes, child, blocks, scale, reach), place, triangle_of, wide.depth)
+    return Layout(WideScene(nodes, blocks, scale, reach), place, triangle_of, wide.depth)
 
 
 def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
@@ -81,15 +81,16 @@ def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndar
     return scene.remap.face, scene.remap.rotation
 
 
-def _nodes(wide: WideTree, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def _nodes(wide: WideTree, scale: np.float32) -> np.ndarray:
     """Wide nodes as the walk reads them: scaled, empty lanes not a number, padded to a size class."""
     count = len(wide.boxes)
-    boxes = aligned_full((size_class(count), 6, WIDTH), np.nan)
-    np.multiply(wide.boxes, scale, out=boxes[:count])
-    np.copyto(boxes[:count], np.nan, where=(wide.child == EMPTY)[:, None])
-    child = np.full(WIDTH * len(boxes) + 2 * WIDTH, DONE, np.int32)
-    child[: wide.child.size] = wide.child.ravel()
-    return boxes, child
+    nodes = aligned_full((size_class(count + 1), 7, WIDTH), np.nan)
+    np.multiply(wide.boxes, scale, out=nodes[:count, :6])
+    np.copyto(nodes[:count, :6], np.nan, where=(wide.child == EMPTY)[:, None])
+    children = nodes[:, 6].view(np.int32)
+    children[:] = DONE
+    children[:count] = wide.child
+    return nodes
 
 
 def scale_of(scene: "Scene") -> np.float32:

@@ -48,16 +48,15 @@ class WideScene(NamedTuple):
     """A scene as arrays on a device; sizes are padded so that scenes of like size share a compiled program.
 
     Attributes:
-        boxes: (w, 6, 8) float32, NaN in empty lanes.
-        child: (8 w + 16,) int32, as in `WideTree`, then `DONE`.
+        nodes: (w, 7, 8) float32, six rows of boxes, NaN in empty lanes, then the bits of the children (int32, as
+            in `WideTree`, `DONE` in empty lanes). The last node has no children.
         blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
             NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
         scale: () float32, the power of two that positions were multiplied by.
         reach: () float32, the largest scaled coordinate.
     """
 
-    boxes: Any
-    child: Any
+    nodes: Any
     blocks: Any
     scale: Any
     reach: Any
@@ -163,7 +162,7 @@ def trace_rays(
     groups = len(origins) // options.interleave
     prepared = jax.vmap(lambda *ray: _prepare(scene, *ray))(origins, directions, t_max)
     floats, ints = (a.reshape(groups, options.interleave, -1) for a in prepared)
-    end = len(scene.child) // WIDTH - 2
+    end = len(scene.nodes) - 1
 
     # The bottom of a stack is a node whose every child is DONE.
     floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
@@ -215,7 +214,9 @@ def _next_child(
     node = jnp.where(empty, top[0], node)
     lanes = jnp.where(empty, top[1], lanes)
     order = 31 - lax.clz(lanes)
-    child = lax.dynamic_slice(scene.child, (index(node * WIDTH + (order ^ ray.mirror)),), (1,))[0]
+    at = (index(node), jnp.uint32(6), index(order ^ ray.mirror))
+    bits = lax.dynamic_slice(scene.nodes, at, (1, 1, 1))[0, 0, 0]
+    child = lax.bitcast_convert_type(bits, jnp.int32)
     return _Place(child, node, lanes ^ (jnp.int32(1) << order), height)
 
 
@@ -226,9 +227,8 @@ def _visit_node(
     entry = jnp.stack([place.node, place.lanes])[None]
     stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
     height = jnp.where(place.lanes != 0, place.height + 1, place.height)
-    boxes = lax.dynamic_slice(scene.boxes, (index(place.child), jnp.uint32(0), jnp.uint32(0)), (1, 6, WIDTH))[
-        0
-    ]
+    at = (index(place.child), jnp.uint32(0), jnp.uint32(0))
+    boxes = lax.dynamic_slice(scene.nodes, at, (1, 6, WIDTH))[0]
     lanes = jnp.sum(jnp.where(lanes_met(boxes, ray.slab, limit), ray.lane_bits, 0))
     there = _next_child(scene, ray, place.child, lanes, height, stack)
     # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
@@ -295,7 +295,7 @@ class _Walk:
         found = jnp.bool_(False)
         for place in state.places:
             found = found | at(place)
-        return found & (state.turns <= len(self.rays) * len(self.scene.boxes))
+        return found & (state.turns <= len(self.rays) * len(self.scene.nodes))
 
     def visit_nodes(self, state: _State, bests: tuple[_Best, ...]) -> _State:
         """Each ray that is at an inner node visits it."""
