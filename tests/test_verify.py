@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import settings as limits
+from hypothesis.strategies import booleans
 from oracles import OracleTracer
 from strategies import cube, grid, meshes, sphere, stack
 
@@ -302,3 +303,21 @@ def test_bunny(real_mesh: Callable[[str], object]) -> None:
     report = verify(scene, mesh, VerifyOptions(rays=128, aimed_rays=20000), tracer=Tracer(scene))
     assert report.ok, report.to_dict()
     assert report.aimed_certain > 18000
+
+
+@given(meshes(), booleans())
+@limits(max_examples=30)
+def test_the_real_tracer_is_proved_on_any_mesh(mesh: Mesh, remap: bool) -> None:
+    if clean(mesh).mesh.triangle_count == 0:
+        return
+    report = verify(scene_of(mesh, remap=remap), mesh, FEW)
+    assert report.ok, report.flaws
+
+
+def test_a_needle_seen_along_its_line_is_no_phantom() -> None:
+    # Every sign of its edge functions is rounding noise, for rays that pass far from it too.
+    along = np.arange(7)[:, None] * np.array([1e-8, 2e-8, -3e-8])
+    faces = [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [1, 5, 6]]
+    mesh = Mesh(along.astype(np.float32), np.array(faces, np.int32))
+    report = verify(scene_of(mesh), mesh, VerifyOptions(rays=64, aimed_rays=512))
+    assert report.ok, report.flaws

@@ -295,6 +295,8 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
         triangle: (r,) int32, written; -1 on a miss.
     """
     weights = np.zeros(3, np.float32)
+    way = np.zeros(3, np.float32)
+    start = np.zeros(3, np.float32)
     x = np.zeros(3, np.float32)
     y = np.zeros(3, np.float32)
     for r in range(len(face)):
@@ -309,19 +311,24 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
         lane = (slot >> 2) & 7
         turn = slot & 3
 
+        # Take the ray as the walk does, which reads denormals as zero.
+        for k in range(3):
+            way[k] = flushed(directions[r, k])
+            start[k] = flushed(flushed(origins[r, k]) * scale)
+
         # Shear the corners so that the ray runs along its dominant axis.
-        size_x = abs(directions[r, 0])
-        size_y = abs(directions[r, 1])
-        size_z = abs(directions[r, 2])
+        size_x = abs(way[0])
+        size_y = abs(way[1])
+        size_z = abs(way[2])
         kz = 0 if size_x >= size_y and size_x >= size_z else (1 if size_y >= size_z else 2)
         kx = 0 if kz == 2 else kz + 1
         ky = 0 if kx == 2 else kx + 1
-        slope_x = directions[r, kx] / directions[r, kz]
-        slope_y = directions[r, ky] / directions[r, kz]
+        slope_x = flushed(way[kx] / way[kz])
+        slope_y = flushed(way[ky] / way[kz])
         for j in range(3):
-            z = flushed(blocks[leaf, 3 * kz + j, lane] - flushed(origins[r, kz] * scale))
-            near_x = flushed(blocks[leaf, 3 * kx + j, lane] - flushed(origins[r, kx] * scale))
-            near_y = flushed(blocks[leaf, 3 * ky + j, lane] - flushed(origins[r, ky] * scale))
+            z = flushed(flushed(blocks[leaf, 3 * kz + j, lane]) - start[kz])
+            near_x = flushed(flushed(blocks[leaf, 3 * kx + j, lane]) - start[kx])
+            near_y = flushed(flushed(blocks[leaf, 3 * ky + j, lane]) - start[ky])
             x[j] = flushed(near_x - flushed(slope_x * z))
             y[j] = flushed(near_y - flushed(slope_y * z))
 
@@ -331,6 +338,7 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
         c = flushed(flushed(x[1] * y[0]) - flushed(y[1] * x[0]))
         whole = a + b + c
         inverse = np.float32(1.0) / whole if whole != 0.0 else np.float32(0.0)
+
         weights[turn] = a * inverse
         weights[(turn + 1) % 3] = b * inverse
         weights[(turn + 2) % 3] = c * inverse

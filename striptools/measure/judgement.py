@@ -32,6 +32,8 @@ from striptools.trace.hit import Hits
 
 MOST_FLAWS_TOLD = 5
 SAME_NORMAL = 0.999
+THINNEST = 2.0**-40
+"""Height over length of a face, below which float64 does not tell its normal."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,8 @@ class Judge:
         if self.scene.error_bound == 0:
             ours = _normals(self.scene.positions[self.scene.faces()[hits.triangle[ray]]].astype(np.float64))
             theirs = _normals(self.oracle.positions[self.oracle.faces[candidates.face]])
-            same &= (ours * theirs).sum(axis=1) >= SAME_NORMAL
+            unclear = ~(ours.any(axis=1) & theirs.any(axis=1))
+            same &= unclear | ((ours * theirs).sum(axis=1) >= SAME_NORMAL)
         return np.bincount(ray[same], minlength=len(hits.t)) > 0
 
     def _ties_wrongly(self, hits: Hits) -> np.ndarray:
@@ -258,10 +261,13 @@ def _frames_of(frames: RayFrames, ray: np.ndarray) -> RayFrames:
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:
+    """Unit normals; zero for a needle so thin that rounding in float64 decides where its normal points."""
     a, b, c = corners.transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0, length, 1.0)
+    longest = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))[:, None]
+    clear = length > THINNEST * longest**2
+    return np.where(clear, normals, 0.0) / np.where(clear, length, 1.0)
 
 
 def _first_equal_faces(surface: Surface, surface_face: np.ndarray, face_count: int) -> np.ndarray:

@@ -48,8 +48,8 @@ class WideScene(NamedTuple):
     """A scene as arrays on a device; sizes are padded so that scenes of like size share a compiled program.
 
     Attributes:
-        nodes: (w, 7, 8) float32, six rows of boxes, NaN in empty lanes, then the bits of the children (int32, as
-            in `WideTree`, `DONE` in empty lanes). The last node has no children.
+        nodes: (w, 7, 8) float32, six rows of boxes, NaN in empty lanes, then the bits of the children (int32,
+            as in `WideTree`, `DONE` in empty lanes). The last node has no children.
         blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
             NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
         scale: () float32, the power of two that positions were multiplied by.
