@@ -22,6 +22,7 @@ TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 # Loads every file named on standard input and prints a line of JSON for each; what else it prints is a fault.
 CHILD = """
 import json, resource, sys, time, warnings
+from pathlib import Path
 from striptools.errors import StriptoolsError
 from striptools.mesh.io import load_mesh
 resource.setrlimit(resource.RLIMIT_CPU, (600, 600))
@@ -33,7 +34,9 @@ for path in sys.stdin.read().splitlines():
     except StriptoolsError as error:
         verdict = {"error": str(error), "exit_code": error.exit_code}
     verdict["seconds"] = time.perf_counter() - start
-    verdict["peak"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Not ru_maxrss: that starts with what the process which started this one held.
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    verdict["peak"] = 1024 * int(status["VmHWM"].split()[0])
     print(json.dumps(verdict), flush=True)
 """
 
