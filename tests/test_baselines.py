@@ -112,7 +112,7 @@ def test_stripe_like_refuses_arrays_of_two_meshes() -> None:
 
 
 class SlowTipsify:
-    """Section 3 of the paper, with sets; the faces of a fan in runs as the head of strips/tipsify.py has it."""
+    """Section 3 of the paper, with sets; the faces of a fan in runs, as strips/tipsify.py has it."""
 
     def __init__(self, faces: np.ndarray, vertex_count: int, cache_size: int) -> None:
         self.faces, self.cache_size = faces.tolist(), cache_size

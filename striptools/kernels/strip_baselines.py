@@ -333,10 +333,8 @@ def cut_into_strips(faces, order, most, starts):
     entered = 0
     for k in range(order.shape[0]):
         # Follow the sets of slots by which each face can be entered.
-        if k > 0 and k - begin < most:
-            entered = slots_after(faces, order[k - 1], entered, order[k])
-        else:
-            entered = 0
+        follows = k > 0 and k - begin < most
+        entered = slots_after(faces, order[k - 1], entered, order[k]) if follows else 0
         if entered == 0:
             begin = k
             starts[strips] = k
