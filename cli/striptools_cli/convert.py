@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO, Annotated, cast
 
 import typer
 
@@ -15,7 +15,14 @@ from striptools.pipeline import Options, Report, convert_with_report
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Stopwatch
-from striptools.strips.ordering import OrderingOptions
+from striptools.strips.ordering import (
+    EFFORT_NAMES,
+    METHODS,
+    SMALLEST_BLOCK,
+    EffortName,
+    Method,
+    OrderingOptions,
+)
 from striptools_cli import log, notice
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes, human_value, render
@@ -65,11 +72,27 @@ def run(
     max_length: Annotated[
         int, typer.Option(min=1, metavar="N", help="Most triangles in a strip.")
     ] = _ORDER.max_length,
+    stripifier: Annotated[
+        str, typer.Option(metavar="NAME", help=f"How strips are made: {', '.join(METHODS)}.")
+    ] = _ORDER.method,
+    effort: Annotated[
+        str,
+        typer.Option(metavar="NAME", help=f"How long strip-rt searches: {', '.join(EFFORT_NAMES)}."),
+    ] = _ORDER.effort,
+    block: Annotated[
+        int | None,
+        typer.Option(
+            min=SMALLEST_BLOCK,
+            metavar="N",
+            help="Cut into blocks of at most N triangles and N vertices, and order inside them (strip-rt).",
+            show_default="no blocks",
+        ),
+    ] = _ORDER.block,
     distance_weight: Annotated[
-        float, typer.Option(min=0.0, metavar="W", help="Weight of nearness in the SAH tree when strips join.")
+        float, typer.Option(min=0.0, metavar="W", help="Weight of nearness when strips join (paper).")
     ] = _ORDER.distance_weight,
     balance_weight: Annotated[
-        float, typer.Option(min=0.0, metavar="W", help="Weight of equal lengths when strips join.")
+        float, typer.Option(min=0.0, metavar="W", help="Weight of equal lengths when strips join (paper).")
     ] = _ORDER.balance_weight,
     threads: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
@@ -96,7 +119,14 @@ def run(
     log.set_up(quiet=quiet, verbose=verbose)
     options = Options(
         clean=CleanOptions(weld=weld, drop_duplicates=drop_duplicates),
-        ordering=OrderingOptions(max_length, distance_weight, balance_weight),
+        ordering=OrderingOptions(
+            max_length,
+            cast(Method, stripifier),
+            cast(EffortName, effort),
+            distance_weight,
+            balance_weight,
+            block,
+        ),
         remap=not no_remap,
         threads=threads,
     )
@@ -145,7 +175,7 @@ def _check_names(source: str, target: str, report: str | None) -> None:
 def _to_scene(
     source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
 ) -> _Outcome:
-    notice.before_kernels("strip_ordering", quiet=quiet)
+    notice.before_kernels("strip_chunks", quiet=quiet)
     clock = Stopwatch()
     with StageProgress(quiet=quiet) as progress:
         scene, report = convert_with_report(

@@ -1,0 +1,138 @@
+"""From faces to strips: chooses the method, cuts the tree, and shares the ranges out among threads.
+
+Strip-RT as it is used here (`method="strip-rt"`) cuts the object tree into chunks, or into blocks where asked
+to (partition/cut.py), and in each range finds neighbours (mesh/adjacency.py), links greedily
+(strips/linking.py) and tunnels (strips/tunnelling.py). No strip crosses a range. The other methods order the
+mesh as a whole: `paper` is Strip-RT as it is printed (strips/ordering.py), `stripe` and `tipsify` are
+baselines to compare with (strips/stripe_like.py, strips/tipsify.py).
+
+The ranges depend on the tree alone and each is ordered by one thread, so the strips are the same for any
+number of threads.
+
+Cost: O(n) after the tree for bounded caps; about 150 bytes a face of a chunk and thread, 5 bytes a face of
+the mesh and 4 bytes a vertex and thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from striptools.errors import UsageError
+from striptools.mesh.adjacency import build_adjacency
+from striptools.partition.cut import CHUNK, Cut, cut_tree, grouped
+from striptools.strips.ordering import OrderingOptions, Sequences, order_strips
+from striptools.strips.tunnelling import EFFORTS, NO_TUNNELS, Effort
+from striptools.types import Boxes, Counts, Faces
+
+if TYPE_CHECKING:
+    from striptools.partition.object_split import ObjectTree
+
+Progress = Callable[[float], None]
+"""Called with the fraction done, above 0 and below 1."""
+
+
+def stripify(
+    faces: Faces,
+    vertex_count: int,
+    boxes: Boxes,
+    tree: ObjectTree,
+    options: OrderingOptions | None = None,
+    threads: int = 1,
+    watch: Progress | None = None,
+) -> Sequences:
+    """Order faces into strips by the method asked for.
+
+    Args:
+        faces: (n, 3) int32, indices below `vertex_count`.
+        vertex_count: How many vertices there are.
+        boxes: (n, 6) float32, the faces' boxes.
+        tree: Object tree with one face an item.
+        options: Method, cap, effort and blocks; the defaults of OrderingOptions when left out.
+        threads: How many threads share the work; the strips are the same for any number.
+        watch: Told how far the work is.
+
+    Returns:
+        Sequences of at most max_length faces, for which `check_sequences` holds.
+
+    Raises:
+        UsageError: Arrays that do not belong together.
+    """
+    options = options or OrderingOptions()
+    if not len(faces) == len(boxes) == len(tree.order):
+        raise UsageError("faces, boxes and tree are not of one mesh", where="stripify")
+    if options.method == "strip-rt":
+        cut = cut_for(tree, faces, vertex_count, options)
+        effort = EFFORTS[options.effort]
+        return order_cut(faces, vertex_count, boxes, tree, cut, options.max_length, effort, threads, watch)
+    if options.method == "tipsify":
+        from striptools.strips.tipsify import tipsify
+
+        return tipsify(faces, vertex_count, options)
+    adjacency = build_adjacency(faces, vertex_count)
+    if options.method == "stripe":
+        from striptools.strips.stripe_like import stripe_like
+
+        return stripe_like(adjacency, faces, options)
+    return order_strips(adjacency, faces, tree, options)
+
+
+def cut_for(tree: ObjectTree, faces: Faces, vertex_count: int, options: OrderingOptions) -> Cut:
+    """The ranges in which Strip-RT orders: blocks of at most `block` triangles and vertices, or chunks."""
+    if options.block is None:
+        return cut_tree(tree, CHUNK)
+    return cut_tree(tree, options.block, faces=faces, vertex_count=vertex_count, most_vertices=options.block)
+
+
+def order_cut(
+    faces: Faces,
+    vertex_count: int,
+    boxes: Boxes,
+    tree: ObjectTree,
+    cut: Cut,
+    max_length: int,
+    effort: Effort | None = NO_TUNNELS,
+    threads: int = 1,
+    watch: Progress | None = None,
+) -> Sequences:
+    """Order the faces inside each range of a cut: link, then tunnel with an effort, or only link for None.
+
+    Args:
+        faces: (n, 3) int32.
+        vertex_count: How many vertices there are.
+        boxes: (n, 6) float32.
+        tree: Object tree with one face an item.
+        cut: Ranges of its order.
+        max_length: The most faces of a strip.
+        effort: How tunnels are searched, or None for none.
+        threads: How many threads share the ranges.
+        watch: Told how far the work is.
+    """
+    from striptools.kernels.strip_chunks import order_ranges
+
+    count = len(faces)
+    placed, is_first = np.zeros(count, np.int32), np.zeros(count, np.bool_)
+    given = (faces, boxes, tree.order, tree.leaf_node, tree.parent, tree.size, cut.starts)
+    numbers = effort.numbers if effort else (-1, 0, 0.0, 0.0, 0)
+    own = threading.local()
+
+    def order_job(job: tuple[int, int]) -> None:
+        if not hasattr(own, "number"):
+            own.number = np.full(vertex_count, -1, np.int32)
+        order_ranges(*given, *job, max_length, numbers, own.number, placed, is_first)
+
+    jobs = _jobs(cut)
+    with ThreadPoolExecutor(threads) as pool:
+        for done, _ in enumerate(pool.map(order_job, jobs)):
+            if watch and done:
+                watch(done / len(jobs))
+    return Sequences(placed, np.append(np.flatnonzero(is_first), count).astype(np.int32))
+
+
+def _jobs(cut: Cut) -> list[tuple[int, int]]:
+    borders: Counts = grouped(cut, CHUNK)
+    return list(zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True))
