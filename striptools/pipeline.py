@@ -135,14 +135,14 @@ def convert_with_report(
         source_face_count, notes = mesh.triangle_count, mesh.notes
         del mesh, source
     with clock.stage("partition"):
-        boxes = face_boxes(positions, faces)
+        boxes = face_boxes(positions, faces, threads)
         tree = split_objects(boxes, options.partition, threads=threads)
     with clock.stage("order"):
         progress = None if watch is None else partial(watch, "order")
         sequences = stripify(faces, len(positions), boxes, tree, options.ordering, threads, progress)
         del tree
     with clock.stage("hierarchy"):
-        strip_boxes = range_boxes(boxes[sequences.faces], sequences.starts)
+        strip_boxes = range_boxes(boxes, sequences.starts, sequences.faces)
         triangle_counts = np.diff(sequences.starts)
         order, hierarchy = build_strip_hierarchy(
             strip_boxes, triangle_counts, options.partition, threads=threads
