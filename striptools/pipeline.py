@@ -130,7 +130,7 @@ def convert_with_report(
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
     with clock.stage("clean"):
-        cleaned = clean(mesh, options.clean)
+        cleaned = clean(mesh, options.clean, threads)
         faces, positions = _remaining(cleaned)
         source_face_count, notes = mesh.triangle_count, mesh.notes
         del mesh, source

@@ -1,4 +1,4 @@
-"""Threads over nogil kernels: equal chunks of a range, and jobs that give rise to more jobs.
+"""Threads over nogil kernels: equal chunks of a range, parts by hash, and jobs that give rise to more jobs.
 
 Neither decides anything: the caller's kernels write to disjoint places or return what is joined in order, so
 that results do not depend on the number of threads.
@@ -29,6 +29,15 @@ def in_chunks(work: Callable[[tuple[int, int]], Result], count: int, threads: in
     bounds = [count * k // chunks for k in range(chunks + 1)]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(work, pairwise(bounds)))
+
+
+def in_parts(work: Callable[[int, int], Result], count: int, threads: int) -> list[Result]:
+    """Do `work(part, parts)` for a part a thread, and give the results in order; one part for few rows."""
+    parts = max(1, min(threads, count // SMALLEST_CHUNK))
+    if parts == 1:
+        return [work(0, 1)]
+    with ThreadPoolExecutor(parts) as pool:
+        return list(pool.map(work, range(parts), [parts] * parts))
 
 
 def run_jobs(work: Callable[..., Iterable[Iterable[int]]], first: tuple[int, ...], threads: int) -> None:
