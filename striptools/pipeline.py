@@ -149,7 +149,7 @@ def convert_with_report(
         )
         del boxes, strip_boxes
     with clock.stage("output"):
-        strips = encode_strips(faces, sequences.reordered(order))
+        strips = encode_strips(faces, sequences.reordered(order), threads)
         scene = scene_from_strips(
             positions,
             strips,
@@ -157,6 +157,7 @@ def convert_with_report(
             source_face=cleaned.source_face if options.remap else None,
             source_face_count=source_face_count,
             error_bound=cleaned.weld_error,
+            threads=threads,
         )
     counts = cleaned.counts | {"strips": scene.strip_count}
     seconds, peak = clock.read()
