@@ -5,7 +5,7 @@ that hides nothing and a scene that can be traced as it lies.
 """
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import IO
@@ -136,7 +136,8 @@ def convert_with_report(
         del mesh, source
     with clock.stage("partition"):
         boxes = face_boxes(positions, faces, threads)
-        tree = split_objects(boxes, options.partition, threads=threads)
+        block = options.ordering.block or options.partition.block
+        tree = split_objects(boxes, replace(options.partition, block=block), threads=threads)
     with clock.stage("order"):
         progress = None if watch is None else partial(watch, "order")
         sequences = stripify(faces, len(positions), boxes, tree, options.ordering, threads, progress)
@@ -145,7 +146,7 @@ def convert_with_report(
         strip_boxes = range_boxes(boxes, sequences.starts, sequences.faces)
         triangle_counts = np.diff(sequences.starts)
         order, hierarchy = build_strip_hierarchy(
-            strip_boxes, triangle_counts, options.partition, threads=threads
+            strip_boxes, triangle_counts, replace(options.partition, block=None), threads=threads
         )
         del boxes, strip_boxes
     with clock.stage("output"):

@@ -32,6 +32,9 @@ Short = namedtuple("Short", "boxes weight centre rank before right_cost goes_lef
 """A short range while it is split: its rows in float64, by their first places; rank (4, k), the places by
 rising centre on each axis; and room."""
 
+ALIGNED_BLOCKS = 12
+"""Ranges of at most so many blocks are split in alignment with them."""
+
 EMPTY_BOX = (np.float32(np.inf),) * 3 + (np.float32(-np.inf),) * 3
 
 
@@ -424,12 +427,92 @@ def room_for_short(longest):
 
 
 @njit(cache=True, nogil=True)
-def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sah_depth, grain, jobs):
+def aligned_place(rows, begin, end, bounds, block, right_cost):
+    """Find the cheapest place, over three axes, that splits a range without asking for one block more.
+
+    Returns:
+        How many items go left (0 where all centres are equal), and their positions in the order of the axis.
+    """
+    count = end - begin
+    blocks = (count + block - 1) // block
+    best = np.inf
+    best_place = 0
+    best_rank = np.empty(0, np.int64)
+    keys = np.empty(count, np.float64)
+    for axis in range(3):
+        if not bounds[0, 3 + axis] > bounds[0, axis]:
+            continue
+        for i in range(count):
+            keys[i] = centre(rows.boxes, begin + i, axis)
+        rank = np.argsort(keys, kind="mergesort")
+        # Gather the cost of the right side of each place.
+        box = EMPTY_BOX
+        weight = 0
+        for j in range(count - 1, 0, -1):
+            box = join(box, rows.boxes, begin + rank[j])
+            weight += rows.numbers[begin + rank[j], WEIGHT]
+            right_cost[j] = area(box) * weight
+        # Sweep from the left and keep the first of the cheapest places that are allowed.
+        box = EMPTY_BOX
+        weight = 0
+        for place in range(1, count):
+            box = join(box, rows.boxes, begin + rank[place - 1])
+            weight += rows.numbers[begin + rank[place - 1], WEIGHT]
+            if (place + block - 1) // block + (count - place + block - 1) // block == blocks:
+                cost = area(box) * weight + right_cost[place]
+                if cost < best:
+                    best = cost
+                    best_place = place
+                    best_rank = rank
+    return best_place, best_rank
+
+
+@njit(cache=True, nogil=True)
+def align(rows, begin, end, bounds, block, right_cost, spare, sides):
+    """Split a range of few blocks so that they fill well; returns the middle, or `begin` where none is found.
+
+    Rows move like those of `partition`: stably, with the bounds of the centres on both sides.
+    """
+    place, rank = aligned_place(rows, begin, end, bounds, block, right_cost)
+    if place == 0:
+        return begin
+    goes_right = np.ones(end - begin, np.bool_)
+    goes_right[rank[:place]] = False
+    clear_bounds(sides)
+    middle = begin
+    waiting = 0
+    for position in range(begin, end):
+        right = 1 if goes_right[position - begin] else 0
+        grow_bounds(
+            sides,
+            right,
+            centre(rows.boxes, position, 0),
+            centre(rows.boxes, position, 1),
+            centre(rows.boxes, position, 2),
+        )
+        for word in range(4):
+            value = rows.words[position, word]
+            rows.words[middle, word] = value
+            spare[waiting, word] = value
+        middle += 1 - right
+        waiting += right
+    # Bring the right side back.
+    for k in range(waiting):
+        for word in range(4):
+            rows.words[middle + k, word] = spare[k, word]
+    return middle
+
+
+@njit(cache=True, nogil=True)
+def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sah_depth, block, grain, jobs):
     """Split the range of `node` down to single items, or to ranges of at most `grain` items.
 
     Ranges of `grain` items or fewer are written to jobs (rows node, begin, end, depth) and left alone; grain
-    0 leaves none. Returns the number of jobs. Ranges at `sah_depth` or deeper are halved.
+    0 leaves none. Returns the number of jobs. Ranges at `sah_depth` or deeper are halved. Ranges of more than
+    `block` items, up to ALIGNED_BLOCKS blocks, are split so that they fill the least number of blocks; block
+    0 aligns none.
     """
+    right_cost = np.empty(ALIGNED_BLOCKS * block + 1, np.float64)
     bins = Bins(
         np.empty((3 * bin_count, 6), np.float32),
         np.empty(3 * bin_count, np.int64),
@@ -475,10 +558,15 @@ def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sa
         # Split by the cheapest boundary of bins, or in halves where there is none to find.
         tree.size[node] = count
         axis, slot = -1, 0
-        if depth < sah_depth:
+        middle = begin
+        if depth < sah_depth and block < count <= ALIGNED_BLOCKS * block:
+            middle = align(rows, begin, end, bounds, block, right_cost, spare, sides)
+        elif depth < sah_depth:
             fill_bins(rows, begin, end, bounds, bins)
             axis, slot = best_bin(bounds, bins)
-        if axis >= 0:
+        if middle > begin:
+            pass
+        elif axis >= 0:
             middle = partition(rows, begin, end, axis, slot, bin_count, bounds, spare, sides)
         else:
             middle = begin + (count + 1) // 2

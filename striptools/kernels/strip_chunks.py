@@ -10,10 +10,17 @@ import numpy as np
 from numba import njit
 
 from striptools.kernels.adjacency import ring_half_edges
-from striptools.kernels.boxes import half_area
 from striptools.kernels.strip_linking import link_range
 from striptools.kernels.strip_ordering import walk_links
-from striptools.kernels.strip_tunnels import LONGEST, Ground, Strips, mirrors, row_cost, search_range
+from striptools.kernels.strip_tunnels import (
+    LONGEST,
+    Ground,
+    Strips,
+    box_area,
+    mirrors,
+    row_cost,
+    search_range,
+)
 
 
 @njit(cache=True, nogil=True)
@@ -39,7 +46,7 @@ def gather_faces(faces, order, begin, end, number, gathered):
 
 @njit(cache=True, nogil=True)
 def gather_boxes(boxes, order, begin, end, gathered):
-    """Copy the boxes of order[begin:end] in the form of strip_tunnels; returns the sum of their half areas."""
+    """Copy the boxes of order[begin:end] in the form of strip_tunnels; returns the sum of their areas."""
     # Find the power of two that brings every coordinate below 1.
     largest = 0.0
     for position in range(begin, end):
@@ -52,12 +59,8 @@ def gather_boxes(boxes, order, begin, end, gathered):
         face = order[begin + i]
         for k in range(3):
             gathered[i, k] = -boxes[face, k] * scale
-            gathered[i, 4 + k] = boxes[face, 3 + k] * scale
-        gathered[i, 3] = 0.0
-        gathered[i, 7] = 0.0
-        total += half_area(
-            -gathered[i, 0], -gathered[i, 1], -gathered[i, 2], gathered[i, 4], gathered[i, 5], gathered[i, 6]
-        )
+            gathered[i, 3 + k] = boxes[face, 3 + k] * scale
+        total += box_area(gathered, i)
     return total
 
 
@@ -68,7 +71,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
     Args:
         ring: (3n,) int32.
         faces: (n, 3) int32.
-        boxes: (n, 8) float32 in the form of strip_tunnels.
+        boxes: (n, 6) float32 in the form of strip_tunnels.
         mate: (3n,) int32 links, changed in place.
         links: (n,) uint8 of each face.
         leaves: The sum of the boxes' half areas.
@@ -95,7 +98,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
         for place in range(strips.length[s]):
             strips.where[rows[strips.begin[s] + place], 0] = s
             strips.where[rows[strips.begin[s] + place], 1] = place
-    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 8), np.float32))
+    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32))
     before, after = search_range(strips, ground, most, deepest, neutral, price, rise, passes, leaves)
     # Write the strips by the place of their first faces, each turned the cheaper way.
     k = 0
@@ -167,7 +170,7 @@ def order_ranges(
         if effort[0] < 0:
             strips = walk_links(mate, links, row, first_places)
         else:
-            scaled = np.empty((count, 8), np.float32)
+            scaled = np.empty((count, 6), np.float32)
             leaves = gather_boxes(boxes, order, begin, end, scaled)
             strips, was, became = tunnel_range(
                 ring, here, scaled, mate, links, leaves, most, effort, row, first_places

@@ -6,8 +6,8 @@ the last face of its row, its *head* the first. A *rotation* links the end t of 
 strip b and cuts one of u's links; the part of b on the far side of the cut leaves b for a, and the face w
 at the near side is the new end. Within one strip (a = b) the cut must face t, or a ring would close.
 
-Boxes are (n, 8) float32: minus the low corner, 0, the high corner, 0, so that a union is eight maxima; they
-are scaled by a power of two to lie within -1 and 1, so that no area overflows float32 and no box is rounded.
+Boxes are (n, 6) float32: minus the low corner, then the high corner, so that a union is six maxima; they are
+scaled by a power of two to lie within -1 and 1, so that no area overflows float32 and no box is rounded.
 """
 
 from collections import namedtuple
@@ -25,18 +25,20 @@ TOP_WEIGHT = 4.0
 """What the hierarchy over the strips costs for a strip, in areas of the strip's box."""
 
 Ground = namedtuple("Ground", "ring faces boxes mirror room")
-"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 8) float32, the table of `mirrors`, and
-room (LONGEST, 8) float32 for evaluations."""
+"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`, and
+room (LONGEST, 6) float32 for evaluations."""
 
 Strips = namedtuple("Strips", "rows begin length cost kept changed where mate")
-"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, cost (s,) float64 of
-the row it has now (negative: not known) and kept (s,) that of the last accepted one, and changed (s,) int32,
-when that was; where (n, 2) int32, strip and place of each face; mate (3n,) int32, the linked half-edge or -1."""
+"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, cost (s,) float64
+of the row it has now (negative: not known) and kept (s,) that of the last accepted one, and changed (s,)
+int32, when that was; where (n, 2) int32, strip and place of each face; mate (3n,) int32, the linked half-edge
+or -1."""
 
 Search = namedtuple("Search", "level path saved touched best")
 """Working room of one search: level (k, 4) int32 by depth: strip, slot, half-edge, side that are tried now;
-path (k, 10) int32, the rotations done: half-edges h, g, cut, its mate, then strip, begin, length of a and of b; saved (k, 2)
-their costs; touched (k,) int32 strips; best (k, 3) int32 the rotations h, g, cut of the best find, then its merge."""
+path (k, 10) int32, the rotations done: half-edges h, g, cut, its mate, then strip, begin, length of a and of
+b; saved (k, 2) float64 their costs; touched (k,) int32 strips; best (k, 3) int32 the rotations h, g, cut of
+the best find, then its merge."""
 
 
 @njit(cache=True, nogil=True)
@@ -53,13 +55,22 @@ def mirrors():
     return table
 
 
-@njit(cache=True, nogil=True)
-def box_area(box):
-    """Half area of a box of eight numbers."""
-    x = box[4] + box[0]
-    y = box[5] + box[1]
-    z = box[6] + box[2]
+@njit(cache=True, nogil=True, inline="always")
+def box_area(boxes, row):
+    """Half area of a box."""
+    x = boxes[row, 3] + boxes[row, 0]
+    y = boxes[row, 4] + boxes[row, 1]
+    z = boxes[row, 5] + boxes[row, 2]
     return np.float64(x * y + y * z + z * x)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def join_boxes(boxes, one, other, out, row):
+    """Write the box around two to a row of `out`."""
+    for q in range(6):
+        a = boxes[one, q]
+        b = boxes[other, q]
+        out[row, q] = a if a > b else b
 
 
 @njit(cache=True, nogil=True)
@@ -70,7 +81,7 @@ def row_cost(rows, begin, length, boxes, mirror, room):
     reversed is below length - m, because each halving gives the odd face to the left.
     """
     if length == 1:
-        return TOP_WEIGHT * box_area(boxes[rows[begin]])
+        return TOP_WEIGHT * box_area(boxes, rows[begin])
     m = 1
     while 2 * m < length:
         m *= 2
@@ -79,29 +90,22 @@ def row_cost(rows, begin, length, boxes, mirror, room):
     k = begin
     pairs = length - m
     for i in range(m):
-        one = rows[k]
-        k += 1
         if mirror[m + i] < pairs:
-            other = rows[k]
-            k += 1
-            for q in range(8):
-                a = boxes[one, q]
-                b = boxes[other, q]
-                room[i, q] = a if a > b else b
-            total += box_area(room[i])
+            join_boxes(boxes, rows[k], rows[k + 1], room, i)
+            total += box_area(room, i)
+            k += 2
         else:
-            for q in range(8):
+            one = rows[k]
+            for q in range(6):
                 room[i, q] = boxes[one, q]
+            k += 1
     # Join them level by level, in place.
     while m > 1:
         m //= 2
         for i in range(m):
-            for q in range(8):
-                a = room[2 * i, q]
-                b = room[2 * i + 1, q]
-                room[i, q] = a if a > b else b
-            total += box_area(room[i])
-    return total + TOP_WEIGHT * box_area(room[0])
+            join_boxes(room, 2 * i, 2 * i + 1, room, i)
+            total += box_area(room, i)
+    return total + TOP_WEIGHT * box_area(room, 0)
 
 
 @njit(cache=True, nogil=True)
@@ -249,7 +253,7 @@ def change_of(strips, ground, touched, count, skip, other):
 
 @njit(cache=True, nogil=True)
 def append_row(strips, a, c, head_first, top):
-    """Write strip a's row and behind it strip c's, from its head or its end, to the top; returns its length."""
+    """Write strip a's row and behind it strip c's, from its head or end, to the top; returns the length."""
     rows = strips.rows
     k = top
     begin = strips.begin[a]
@@ -271,7 +275,7 @@ def append_row(strips, a, c, head_first, top):
 
 @njit(cache=True, nogil=True)
 def may_merge(strips, ground, w, freed, t, b, rest, most):
-    """Whether face w, an end of strip b with `rest` faces once its link by `freed` is cut, may find a partner."""
+    """Whether w, an end of strip b of `rest` faces once its link by `freed` is cut, may find a partner."""
     for slot in range(3):
         h = 3 * w + slot
         if strips.mate[h] >= 0 or h == freed:
@@ -476,7 +480,7 @@ def compact(strips, spare):
 
 @njit(cache=True, nogil=True)
 def by_length(length, order, longest):
-    """List the strips of 1 to `longest` faces in `order`, the shortest first, equals by number; returns how many."""
+    """List the strips of up to `longest` faces in `order`, the shortest first, equals by number."""
     first = np.zeros(longest + 2, np.int32)
     for s in range(length.shape[0]):
         if 0 < length[s] <= longest:
@@ -488,6 +492,23 @@ def by_length(length, order, longest):
             order[first[length[s]]] = s
             first[length[s]] += 1
     return first[longest]
+
+
+@njit(cache=True, nogil=True)
+def changed_near(strips, ring, s, since):
+    """Whether strip s, or one that its ends might go into, has been changed after a time."""
+    if strips.changed[s] > since:
+        return True
+    begin = strips.begin[s]
+    for k in range(2):
+        t = strips.rows[begin + k * (strips.length[s] - 1)]
+        for h in range(3 * t, 3 * t + 3):
+            g = ring[h]
+            while g != h:
+                if strips.changed[strips.where[g // 3, 0]] > since:
+                    return True
+                g = ring[g]
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -545,6 +566,9 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
         waiting = by_length(strips.length, order, longest)
         for k in range(waiting):
             s = order[k]
+            if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, tried[s]):
+                continue
+            tried[s] = now
             for side in range(2):
                 if strips.length[s] == 0 or (side == 1 and strips.length[s] == 1):
                     break

@@ -11,7 +11,10 @@ Differences and decisions:
 3. Ranges whose centres are all equal are halved, the first half (the larger one of an odd count) to the left.
 4. Ranges at depth SAH_DEPTH or deeper are halved too, so that no input makes a tree deeper than
    LARGEST_DEPTH.
-5. Nodes are numbered in preorder by size alone, so ids do not depend on threads or schedule.
+5. With `block` set, ranges of more than one block and up to ALIGNED_BLOCKS are swept exactly over the places
+   that ask for no block more: ceil(left / block) + ceil(right / block) = ceil(all / block). Blocks cut from
+   the tree (partition/cut.py) are then filled to 94 % instead of 68 % (dragon, blocks of 256).
+6. Nodes are numbered in preorder by size alone, so ids do not depend on threads or schedule.
 
 Cost: O(n log n) time in practice; 32 bytes an item of working memory beside the tree's 24, and up to 32 more
 for the right sides of the ranges in work, before most of the tree is touched.
@@ -166,7 +169,7 @@ def _split_in_threads(
 ) -> None:
     """Split range by range in a pool while they are large, then each down to single items."""
     count = len(rows.words)
-    limits = (options.bins, options.sweep_below, SAH_DEPTH)
+    limits = (options.bins, options.sweep_below, SAH_DEPTH, options.block or 0)
     smallest = max(SMALLEST_JOB, count // (16 * threads))
 
     def split(node: int, begin: int, end: int, depth: int) -> list[list[int]]:

@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from striptools.errors import UsageError
+from striptools.partition.sah import LARGEST_BLOCK, SMALLEST_BLOCK
 from striptools.types import Counts, FaceIds, Faces
 
 if TYPE_CHECKING:
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from striptools.partition.object_split import ObjectTree
 
 LARGEST_LENGTH = 2**30
-SMALLEST_BLOCK = 4
 
 Method = Literal["strip-rt", "paper", "stripe", "tipsify"]
 EffortName = Literal["fast", "normal", "best"]
@@ -65,8 +65,8 @@ class OrderingOptions:
         effort: How long `strip-rt` searches: `fast`, `normal` or `best` (strips/tunnelling.py).
         distance_weight: Weight of nearness in the tree, 0 or more; looked at by `paper`.
         balance_weight: Weight of equal lengths, 0 or more; looked at by `paper`.
-        block: Cut the mesh into blocks of at most so many triangles and as many vertices first, 4 or more,
-            and order inside them; looked at by `strip-rt`. None for no blocks.
+        block: Cut the mesh into blocks of at most so many triangles and as many vertices first, 4 to
+            65536, and order inside them; looked at by `strip-rt`. None for no blocks.
     """
 
     max_length: int = 128
@@ -80,9 +80,11 @@ class OrderingOptions:
         for name, value, allowed in (("method", self.method, METHODS), ("effort", self.effort, EFFORT_NAMES)):
             if value not in allowed:
                 raise UsageError(f"{value!r} is not known", where=name, remedy=f"give {', '.join(allowed)}")
-        if self.block is not None and not SMALLEST_BLOCK <= self.block <= LARGEST_LENGTH:
+        if self.block is not None and not SMALLEST_BLOCK <= self.block <= LARGEST_BLOCK:
             raise UsageError(
-                f"{self.block} is out of range", where="block", remedy=f"give {SMALLEST_BLOCK} or more"
+                f"{self.block} is out of range",
+                where="block",
+                remedy=f"give {SMALLEST_BLOCK} to {LARGEST_BLOCK}",
             )
         if not 1 <= self.max_length <= LARGEST_LENGTH:
             raise UsageError(

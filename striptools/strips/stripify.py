@@ -16,7 +16,7 @@ the mesh and 4 bytes a vertex and thread.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -126,11 +126,21 @@ def order_cut(
         order_ranges(*given, *job, max_length, numbers, own.number, placed, is_first)
 
     jobs = _jobs(cut)
-    with ThreadPoolExecutor(threads) as pool:
-        for done, _ in enumerate(pool.map(order_job, jobs)):
-            if watch and done:
-                watch(done / len(jobs))
+    for done, _ in enumerate(_in_order(order_job, jobs, threads)):
+        if watch and done:
+            watch(done / len(jobs))
     return Sequences(placed, np.append(np.flatnonzero(is_first), count).astype(np.int32))
+
+
+def _in_order(
+    work: Callable[[tuple[int, int]], None], jobs: list[tuple[int, int]], threads: int
+) -> Iterator[None]:
+    """Do the jobs, in this thread where there is one thread only, and yield as each is done in their order."""
+    if threads <= 1:
+        yield from map(work, jobs)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(work, jobs)
 
 
 def _jobs(cut: Cut) -> list[tuple[int, int]]:

@@ -3,9 +3,10 @@
 Greedy linking ends when no two open ends touch, which leaves strips of 12 on the Stanford dragon. An end t of
 a strip can still go on: into an inner face u of a strip beside it, which is cut in two there. That is a
 *rotation*; it keeps the number of strips, and leaves a new end w where the other part begins. A few rotations
-on, some new end touches the end of another strip, and the two merge: one strip fewer. Such a chain is the
-alternating path, or tunnel, of Porcu and Scateni ("An Iterative Stripification Algorithm Based on Dual Graph
-Operations", Eurographics 2003 short papers), here with another aim:
+on, some new end touches the end of another strip, and the two merge: one strip fewer. Such a chain is a
+tunnel of Stewart ("Tunneling for Triangle Strips in Continuous Level-of-Detail Meshes", Graphics Interface
+2001) and of Porcu and Scateni ("An Iterative Stripification Algorithm Based on Dual Graph Operations",
+Eurographics 2003), who want few strips and nothing else. Differences:
 
 1. A chain is judged by what it does to the boxes. Each strip costs the half areas of the inner nodes of its
    balanced tree, plus TOP_WEIGHT times that of its own box for the hierarchy above; leaves cost the same
@@ -17,12 +18,14 @@ Operations", Eurographics 2003 short papers), here with another aim:
 3. The sum of all costs, leaves included, may nowhere exceed what it was after linking by more than `rise`.
 4. Chains are tried by rising number of rotations; the first number that gives one is taken. Passes go over
    the strips from the shortest to the longest (stable), and over both ends of each.
-5. Strips longer than LONGEST faces are left as they are, and a search ends after MOST_ROTATIONS: time is
+5. From the second pass on, a strip is searched again only where it, or a strip beside its ends, has changed
+   since.
+6. Strips longer than LONGEST faces are left as they are, and a search ends after MOST_ROTATIONS: time is
    linear whatever the mesh.
-6. At the end each strip is written in the direction in which its balanced tree (the odd face goes to the
+7. At the end each strip is written in the direction in which its balanced tree (the odd face goes to the
    first half) costs less.
 
-Cost: O(strips * 4^rotations * length) a pass.
+Cost: O(strips * 4^rotations * length) a pass, with each factor but the first bounded.
 """
 
 from dataclasses import dataclass
@@ -55,8 +58,8 @@ class Effort:
 NO_TUNNELS = None
 
 EFFORTS = {
-    "fast": Effort(rotations=2, neutral=1, price=1.0, rise=0.1, passes=1),
-    "normal": Effort(rotations=3, neutral=1, price=1.0, rise=0.1, passes=2),
-    "best": Effort(rotations=3, neutral=3, price=1.0, rise=0.1, passes=4),
+    "fast": Effort(rotations=2, neutral=1, price=1.5, rise=0.12, passes=1),
+    "normal": Effort(rotations=3, neutral=1, price=1.2, rise=0.12, passes=2),
+    "best": Effort(rotations=3, neutral=3, price=1.2, rise=0.12, passes=4),
 }
 """The efforts by name."""
