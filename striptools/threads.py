@@ -18,12 +18,14 @@ CHUNKS_A_THREAD = 4
 Result = TypeVar("Result")
 
 
-def in_chunks(work: Callable[[tuple[int, int]], Result], count: int, threads: int) -> list[Result]:
+def in_chunks(
+    work: Callable[[tuple[int, int]], Result], count: int, threads: int, smallest: int = SMALLEST_CHUNK
+) -> list[Result]:
     """Do `work((begin, end))` for chunks that cover `0 .. count`, and give the results in order.
 
-    With one thread, or few rows, it is one chunk in the thread of the caller.
+    With one thread, or fewer than twice `smallest` rows, it is one chunk in the thread of the caller.
     """
-    chunks = min(threads * CHUNKS_A_THREAD, count // SMALLEST_CHUNK) if threads > 1 else 1
+    chunks = min(threads * CHUNKS_A_THREAD, count // smallest) if threads > 1 else 1
     if chunks <= 1:
         return [work((0, count))]
     bounds = [count * k // chunks for k in range(chunks + 1)]

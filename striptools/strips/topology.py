@@ -37,6 +37,7 @@ import numpy as np
 from striptools.errors import UsageError
 from striptools.kernels import strip_topology as kernels
 from striptools.strips.ordering import Sequences
+from striptools.threads import SMALLEST_CHUNK, in_chunks
 from striptools.types import Bools, Counts, FaceIds, Faces, Rotations
 
 RESTART = -1
@@ -65,12 +66,13 @@ class Strips:
     rotation: Rotations
 
 
-def encode_strips(faces: Faces, sequences: Sequences) -> Strips:
+def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strips:
     """Write sequences of faces as generalised strips.
 
     Args:
         faces: (n, 3) int32.
         sequences: Each face once, neighbours share an edge run in opposite directions.
+        threads: How many threads share the strips; the result is the same for any number.
 
     Returns:
         Strips whose decoded triangles are the faces of `sequences.faces`, turned left by `rotation`.
@@ -79,49 +81,43 @@ def encode_strips(faces: Faces, sequences: Sequences) -> Strips:
         UsageError: A face in a sequence cannot be reached from the face before it.
     """
     order, starts = sequences.faces, sequences.starts
-    entries = _entries(faces, sequences)
     vertices = np.zeros(len(order) + 2 * (len(starts) - 1), np.int32)
     turns = np.zeros(len(order), np.bool_)
     rotation = np.zeros(len(order), np.uint8)
-    kernels.encode(faces, order, starts, entries, vertices, turns, rotation)
+    broken = in_chunks(
+        lambda part: kernels.encode(faces, order, starts, *part, vertices, turns, rotation),
+        len(starts) - 1,
+        threads,
+        _strips_a_chunk(starts),
+    )
+    _refuse_break(next((place for place in broken if place >= 0), -1), "encode_strips")
     return Strips(vertices, turns, starts, order, rotation)
 
 
-def decode_strips(vertices: Counts, turns: Bools, starts: Counts) -> Faces:
+def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int = 1) -> Faces:
     """The triangles of generalised strips, (n, 3) int32, in file order and with the winding of their sources.
 
     Args:
         vertices: (n + 2 s,) int32.
         turns: (n,) bool; those of first triangles are not looked at.
         starts: (s+1,) int32, from 0 to n, rising.
+        threads: How many threads share the strips.
 
     Raises:
         UsageError: Arrays whose lengths do not belong together.
     """
-    a, b, c = corner_places(turns, starts)
-    if len(vertices) != len(c) + 2 * (len(starts) - 1):
-        raise UsageError(f"{len(vertices)} vertices for {len(c)} triangles", where="decode_strips")
-    return np.stack([vertices[a], vertices[b], vertices[c]], axis=1)
-
-
-def corner_places(turns: Bools, starts: Counts) -> tuple[Counts, Counts, Counts]:
-    """Where in the strip vertices the three corners of each triangle stand: three arrays (n,) int32.
-
-    Raises:
-        UsageError: starts that do not rise from 0 to the number of turns.
-    """
-    count = len(turns)
-    if len(starts) == 0 or starts[0] != 0 or starts[-1] != count or (np.diff(starts) < 1).any():
-        raise UsageError(f"strip starts do not rise from 0 to {count}", where="starts")
-    last = np.arange(2, count + 2, dtype=np.int32)
-    last += 2 * np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
-    # The vertex before the newest is corner 0 after bit 0 and corner 1 after bit 1; the other one stays what
-    # it was.
-    a = np.where(turns, 0, last - 1)
-    b = np.where(turns, last - 1, 0)
-    a[starts[:-1]] = last[starts[:-1]] - 2
-    b[starts[:-1]] = last[starts[:-1]] - 1
-    return np.maximum.accumulate(a), np.maximum.accumulate(b), last
+    count, strip_count = len(turns), len(starts) - 1
+    _check_starts(starts, count, "starts")
+    if len(vertices) != count + 2 * strip_count:
+        raise UsageError(f"{len(vertices)} vertices for {count} triangles", where="decode_strips")
+    faces = np.zeros((count, 3), np.int32)
+    in_chunks(
+        lambda part: kernels.decode(vertices, turns, starts, *part, faces),
+        strip_count,
+        threads,
+        _strips_a_chunk(starts),
+    )
+    return faces
 
 
 def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: int) -> tuple[int, int, int]:
@@ -214,8 +210,7 @@ def check_sequences(sequences: Sequences, faces: Faces, max_length: int | None =
     _check_starts(starts, len(order), "sequences")
     longest = int(sequences.lengths.max(initial=0))
     _expect(max_length is None or longest <= max_length, "sequences", f"one has {longest} faces")
-    place = kernels.choose_entries(faces, order, starts, np.zeros(len(order), np.uint8))
-    _expect(place < 0, "sequences", f"the face at {place} does not continue the one before it")
+    _refuse_break(kernels.first_break(faces, order, starts), "sequences")
 
 
 def check_strips(strips: Strips, faces: Faces) -> None:
@@ -237,12 +232,13 @@ def check_strips(strips: Strips, faces: Faces) -> None:
     _expect(not wrong.any(), "strips", f"triangle {wrong.argmax()} is not its source face")
 
 
-def _entries(faces: Faces, sequences: Sequences) -> Rotations:
-    entries = np.zeros(len(sequences.faces), np.uint8)
-    place = kernels.choose_entries(faces, sequences.faces, sequences.starts, entries)
-    if place >= 0:
-        raise UsageError(f"the face at {place} does not continue the one before it", where="encode_strips")
-    return entries
+def _refuse_break(place: int, where: str) -> None:
+    _expect(place < 0, where, f"the face at {place} does not continue the one before it")
+
+
+def _strips_a_chunk(starts: Counts) -> int:
+    """The fewest strips that are worth a thread, by what they hold on average."""
+    return max(1, SMALLEST_CHUNK * (len(starts) - 1) // max(1, int(starts[-1])))
 
 
 def _repeats(rows: Faces) -> Bools:
