@@ -22,7 +22,7 @@ from striptools.partition.object_split import ObjectTree
 from striptools.types import Counts, Faces
 
 CHUNK = 32768
-"""Triangles of a chunk at most: small enough for a core's cache, large enough that few strips end at a border."""
+"""Triangles of a chunk at most: small enough for a core's cache, large enough that borders cut few strips."""
 
 
 @dataclass(frozen=True, eq=False)
