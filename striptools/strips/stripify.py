@@ -171,5 +171,4 @@ def _jobs(cut: Cut) -> list[tuple[int, int]]:
 # price 1.0 gives 1.052/1.135, 1.15 1.049/1.143, 1.3 1.047/1.149. Splits aligned with blocks of 256, dragon,
 # by the most blocks of an aligned range: none fills 68 % of a block, duplicates 1.245 vertices a vertex and
 # costs 1.081; 4: 85 %, 1.224, 1.086; 8: 91 %, 1.220, 1.089; 12: 94 %, 1.2196, 1.093.
-# Strips do not cross edges that both faces run the same way: tree_japanesemaple, whose faces are turned at
-# random, stays at 1.213.
+# Strips do not cross edges that both faces run the same way, so tree_japanesemaple stays at 1.213.
