@@ -366,7 +366,7 @@ def finish_few(rows, tree, node, first, begin, count, rank, axis):
 def split_short(rows, tree, node, first, count, depth, sah_depth, short):
     """Split the range of `node` over 3 rows and more, the first of them `first`, down to single items."""
     load_short(rows, first, count, short)
-    begin = 0
+    begin = np.int64(0)
     end = count
     waiting = 0
     while True:
@@ -541,7 +541,7 @@ def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sa
             elif count <= 2:
                 short.rank[0, 0] = 0
                 short.rank[0, 1] = 1
-                finish_few(rows, tree, node, begin, 0, count, short.rank, 0)
+                finish_few(rows, tree, node, begin, np.int64(0), count, short.rank, np.int64(0))
             else:
                 split_short(rows, tree, node, begin, count, depth, sah_depth, short)
             # Take up the next waiting range.
@@ -570,7 +570,9 @@ def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sa
             middle = partition(rows, begin, end, axis, slot, bin_count, bounds, spare, sides)
         else:
             middle = begin + (count + 1) // 2
-            sides[:] = bounds[0]
+            for k in range(6):
+                sides[0, k] = bounds[0, k]
+                sides[1, k] = bounds[0, k]
         # Number the children: the left one follows its parent, the right one the left one's subtree.
         left = node + 1
         right = node + 2 * (middle - begin)

@@ -105,7 +105,7 @@ def choose_strip(rows, count, ways, entries):
     # Go back and keep one slot of each set, such that the face before can be left to it.
     wanted = ALL_SLOTS
     for k in range(count - 1, 0, -1):
-        slot = LEAST_SLOT[entries[k] & wanted]
+        slot = np.int64(LEAST_SLOT[entries[k] & wanted])
         entries[k] = slot
         wanted = ENTRIES_BEFORE[slots_left(ways[k], slot)]
     entries[0] = 3

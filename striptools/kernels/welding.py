@@ -117,7 +117,7 @@ def mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated):
     # Count the faces of the part, for a table of the right size.
     begin = vertex_count * part // parts
     end = vertex_count * (part + 1) // parts
-    mine = 0
+    mine = np.int64(0)
     for face in range(faces.shape[0]):
         least = min(min(faces[face, 0], faces[face, 1]), faces[face, 2])
         mine += 1 if begin <= least < end else 0
