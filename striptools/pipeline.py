@@ -1,11 +1,12 @@
-"""The data's way in one screen: load, clean, partition, adjacency, order, hierarchy, output, scene.
+"""The data's way in one screen: load, clean, partition, order, hierarchy, output, scene.
 
 Source: the four steps of Strip-RT (Lauterbach, Yoon, Tang, Manocha, EGSR 2008, section 4) between a loader
 that hides nothing and a scene that can be traced as it lies.
 """
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -13,7 +14,6 @@ import numpy as np
 
 from striptools.errors import UnreadableMeshError, UsageError
 from striptools.hierarchies.strip_bvh import build_strip_hierarchy
-from striptools.mesh.adjacency import build_adjacency
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
@@ -23,12 +23,14 @@ from striptools.partition.sah import PartitionOptions
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene, scene_from_strips
 from striptools.stopwatch import Stopwatch, Watch
-from striptools.strips.ordering import OrderingOptions, order_strips
+from striptools.strips.ordering import OrderingOptions
+from striptools.strips.stripify import stripify
 from striptools.strips.topology import encode_strips
 from striptools.types import Faces, Positions
 
-STAGES = ("load", "clean", "partition", "adjacency", "order", "hierarchy", "output")
-"""The stages of a conversion, in order; a command that writes the scene adds `write`."""
+STAGES = ("load", "clean", "partition", "order", "hierarchy", "output")
+"""The stages of a conversion, in order; `order` finds the neighbours too, range by range; a command that
+writes the scene adds `write`."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Options:
     Attributes:
         clean: Welding and duplicates.
         partition: The SAH object split.
-        ordering: Strip-RT.
+        ordering: Strips: method, cap, effort, blocks.
         remap: Keep the source face and first corner of every triangle in the scene.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
@@ -128,27 +130,27 @@ def convert_with_report(
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
     with clock.stage("clean"):
-        cleaned = clean(mesh, options.clean)
+        cleaned = clean(mesh, options.clean, threads)
         faces, positions = _remaining(cleaned)
         source_face_count, notes = mesh.triangle_count, mesh.notes
         del mesh, source
     with clock.stage("partition"):
-        boxes = face_boxes(positions, faces)
-        tree = split_objects(boxes, options.partition, threads=threads)
-    with clock.stage("adjacency"):
-        adjacency = build_adjacency(faces, len(positions))
+        boxes = face_boxes(positions, faces, threads)
+        block = options.ordering.block or options.partition.block
+        tree = split_objects(boxes, replace(options.partition, block=block), threads=threads)
     with clock.stage("order"):
-        sequences = order_strips(adjacency, faces, tree, options.ordering)
-        del adjacency, tree
+        progress = None if watch is None else partial(watch, "order")
+        sequences = stripify(faces, len(positions), boxes, tree, options.ordering, threads, progress)
+        del tree
     with clock.stage("hierarchy"):
-        strip_boxes = range_boxes(boxes[sequences.faces], sequences.starts)
+        strip_boxes = range_boxes(boxes, sequences.starts, sequences.faces)
         triangle_counts = np.diff(sequences.starts)
         order, hierarchy = build_strip_hierarchy(
-            strip_boxes, triangle_counts, options.partition, threads=threads
+            strip_boxes, triangle_counts, replace(options.partition, block=None), threads=threads
         )
         del boxes, strip_boxes
     with clock.stage("output"):
-        strips = encode_strips(faces, sequences.reordered(order))
+        strips = encode_strips(faces, sequences.reordered(order), threads)
         scene = scene_from_strips(
             positions,
             strips,
@@ -156,6 +158,7 @@ def convert_with_report(
             source_face=cleaned.source_face if options.remap else None,
             source_face_count=source_face_count,
             error_bound=cleaned.weld_error,
+            threads=threads,
         )
     counts = cleaned.counts | {"strips": scene.strip_count}
     seconds, peak = clock.read()

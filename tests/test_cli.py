@@ -484,7 +484,7 @@ def test_help_names_the_verb_and_its_options(run, verb: str) -> None:
 
 def test_help_shows_defaults_and_ranges(run) -> None:
     out = " ".join(run("convert", "--help")[1].split())
-    assert "default: 64; x>=1" in out
+    assert "default: 128; x>=1" in out
     assert "default: (every core)" in out
     assert "default: (extension)" in out
 

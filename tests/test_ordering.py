@@ -184,7 +184,7 @@ def test_the_score_by_default_weights_is_the_one_that_is_named():
     for n1, n2 in ((130, 10), (70, 70), (1, 1)):
         mean = 2 * n1 * n2 / (n1 + n2)
         assert 0.5 * 4 * n1 * n2 / (n1 + n2) ** 2 == pytest.approx(mean / (n1 + n2))
-    assert OrderingOptions() == OrderingOptions(64, 0.5, 0.5)
+    assert OrderingOptions() == OrderingOptions(128, "strip-rt", "normal", 0.5, 0.5)
 
 
 def test_a_fan_of_triangles_is_one_strip_and_never_closes():
@@ -224,7 +224,9 @@ def test_a_long_band_of_equal_scores_takes_few_rounds():
 def test_more_weight_on_distance_or_balance_changes_the_strips():
     one = prepared(*sphere(3))
     parts = [
-        as_lists(order_strips(*one, OrderingOptions(64, *weights)))
+        as_lists(
+            order_strips(*one, OrderingOptions(64, distance_weight=weights[0], balance_weight=weights[1]))
+        )
         for weights in ((1, 0), (0, 1), (0.5, 0.5))
     ]
     assert parts[0] != parts[1] != parts[2]
@@ -232,9 +234,17 @@ def test_more_weight_on_distance_or_balance_changes_the_strips():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"max_length": 0}, {"max_length": 2**31}, {"distance_weight": -1}, {"balance_weight": float("nan")}],
+    [
+        {"max_length": 0},
+        {"max_length": 2**31},
+        {"distance_weight": -1},
+        {"balance_weight": float("nan")},
+        {"method": "strips"},
+        {"effort": "better"},
+        {"block": 3},
+    ],
 )
-def test_options_out_of_range_are_refused(wrong: dict[str, float]):
+def test_options_out_of_range_are_refused(wrong: dict[str, object]):
     with pytest.raises(UsageError, match=next(iter(wrong))):
         OrderingOptions(**wrong)
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from striptools_cli.report import flatten, human_bytes, human_value, render
+from striptools_cli.report import flatten, human_bytes, human_value, render, render_table
 
 _NAMES = st.text("abcdefghij_", min_size=1, max_size=8)
 _VALUES = st.one_of(
@@ -106,3 +106,22 @@ def test_bytes_are_in_decimal_units(count: int, said: str) -> None:
 )
 def test_values_as_people_read_them(value: object, said: str) -> None:
     assert human_value(value) == said
+
+
+def test_a_table_has_a_row_a_record_in_every_format() -> None:
+    rows = [
+        {"name": "a|b", "count": 1234567, "share_of": 0.123456},
+        {"name": "c", "count": 2, "share_of": None},
+    ]
+    text = render_table(rows, "text", "Things").splitlines()
+    assert text[:2] == ["Things", "  name      count  share of"]
+    assert text[2:] == ["  a|b   1,234,567    0.1235", "  c             2      none"]
+    assert json.loads(render_table(rows, "json", "Things")) == rows
+    assert list(csv.DictReader(io.StringIO(render_table(rows, "csv"))))[1] == {
+        "name": "c",
+        "count": "2",
+        "share_of": "",
+    }
+    lines = render_table(rows, "md", "Things").splitlines()
+    assert lines[:4] == ["## Things", "", "| name | count | share_of |", "| --- | --- | --- |"]
+    assert lines[4] == "| a\\|b | 1234567 | 0.123456 |"

@@ -17,6 +17,7 @@ from striptools.strips.topology import (
     check_sequences,
     check_strips,
     classic_strips,
+    count_classic,
     decode_classic,
     decode_strips,
     decode_triangle,
@@ -118,27 +119,51 @@ def test_each_triangle_can_be_read_alone(strips: Strips):
 
 @given(any_strips(), st.sampled_from([-1, 10**6]))
 def test_classic_strips_of_any_turns_decode_to_the_same_triangles(strips: Strips, restart: int):
-    rows = decode_classic(classic_strips(strips, restart), restart)
-    assert least_turned(rows).tolist() == least_turned(decoded(strips)).tolist()
+    for rows in (
+        decode_classic(classic_strips(strips, restart), restart),
+        decode_classic(classic_strips(strips, None)),
+    ):
+        assert sorted_rows(rows) == sorted_rows(decoded(strips))
 
 
 @given(clean_meshes())
 def test_classic_strips_of_any_mesh_decode_to_the_same_triangles(mesh):
     strips = strips_of(mesh.positions, mesh.faces)
+    for restart in (-1, None):
+        indices = classic_strips(strips, restart)
+        assert sorted_rows(decode_classic(indices)) == sorted_rows(mesh.faces)
+        assert count_classic(strips, restart).restarts == np.count_nonzero(indices == -1)
+
+
+def slow_repeats(turns: list[bool]) -> tuple[int, int]:
+    """Pairs of equal turns inside a strip, and 1 where its first turn costs an index from either end."""
+    inner = turns[2:]
+    misfit = bool(inner) and not inner[0] and inner[-1]
+    return sum(one == other for one, other in itertools.pairwise(inner)), int(misfit)
+
+
+@given(any_strips(), st.sampled_from([-1, None]))
+def test_the_count_of_classic_strips_is_exact_and_no_more_than_the_slow_twins(strips: Strips, restart):
+    count = count_classic(strips, restart)
+    assert count.indices == len(classic_strips(strips, restart))
+    between = count.restarts if restart is not None else 2 * (max(len(strips.starts) - 2, 0) - count.joins)
+    assert count.indices == len(strips.vertices) + count.repeats + between
+    # Vertices differ in all of these strips, so none are joined but those of no strip at all.
+    assert count.joins == 0
+    slow = [slow_repeats(turns.tolist()) for turns in np.split(strips.turns, strips.starts[1:-1])]
+    if restart is not None:
+        assert count.repeats == sum(repeats + misfit for repeats, misfit in slow)
+        assert count.restarts == max(len(strips.starts) - 2, 0)
+
+
+def test_strips_that_share_an_end_vertex_follow_at_once():
+    # Two fans of two triangles that meet in vertex 3 alone.
+    faces = np.array([[0, 1, 2], [2, 1, 3], [3, 4, 5], [5, 4, 6]], np.int32)
+    strips = encode_strips(faces, Sequences(np.arange(4, dtype=np.int32), np.array([0, 2, 4], np.int32)))
     indices = classic_strips(strips)
-    assert np.count_nonzero(indices == -1) == len(strips.starts) - 2
-    assert decode_classic(indices).tolist() == decoded(strips).tolist()
-
-
-@given(any_strips())
-def test_classic_strips_repeat_one_vertex_for_each_pair_of_equal_turns(strips: Strips):
-    repeats = 0
-    for turns in np.split(strips.turns, strips.starts[1:-1]):
-        # The first triangle is turned so that the first turn of every strip is a 0.
-        row = [False, *turns[2:].tolist()]
-        repeats += sum(one == other for one, other in itertools.pairwise(row))
-    restarts = max(len(strips.starts) - 2, 0)
-    assert len(classic_strips(strips)) == len(strips.vertices) + repeats + restarts
+    assert count_classic(strips).joins == 1
+    assert indices.tolist() == [0, 1, 2, 3, 3, 4, 5, 6]
+    assert sorted_rows(decode_classic(indices)) == sorted_rows(faces)
 
 
 def test_a_worked_example():
@@ -150,6 +175,7 @@ def test_a_worked_example():
     assert strips.rotation.tolist() == [0, 2, 2, 2]
     assert decoded(strips).tolist() == [[0, 1, 3], [3, 1, 4], [4, 1, 2], [4, 2, 5]]
     assert classic_strips(strips).tolist() == [0, 1, 3, 1, 4, 2, 5]
+    assert count_classic(strips).repeats == 1
 
 
 def test_faces_that_share_all_edges_leave_a_choice_that_is_taken_right():

@@ -23,6 +23,7 @@ VERBS = {
     "info": "Say what is in a scene file, and how many bytes each part takes.",
     "verify": "Trace a scene file with JAX and prove it against its source mesh.",
     "render": "Draw a picture of a scene file with the same tracer.",
+    "study": "Compare what stripifiers make of a mesh: memory, rays a second, quality.",
     "doctor": "Print the environment, for bug reports.",
 }
 """The verbs, with the line that the list of verbs shows."""

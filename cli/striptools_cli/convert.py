@@ -1,21 +1,31 @@
 """`striptools convert`: a mesh into a scene, or a scene back into a mesh."""
 
 import dataclasses
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO, Annotated, cast
 
 import typer
 
-from striptools.errors import UsageError
-from striptools.mesh.clean import CleanOptions
-from striptools.mesh.io import WRITE_FORMATS, save_mesh
+from striptools.errors import UnreadableMeshError, UsageError
+from striptools.mesh.clean import CleanOptions, clean
+from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh
+from striptools.mesh.mesh import Mesh
+from striptools.partition.sah import LARGEST_BLOCK, SMALLEST_BLOCK
 from striptools.pipeline import Options, Report, convert_with_report
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Stopwatch
-from striptools.strips.ordering import OrderingOptions
+from striptools.strips.export import STRIP_FORMATS, export_strips
+from striptools.strips.ordering import (
+    EFFORT_NAMES,
+    METHODS,
+    EffortName,
+    Method,
+    OrderingOptions,
+)
 from striptools_cli import log, notice
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes, human_value, render
@@ -65,12 +75,35 @@ def run(
     max_length: Annotated[
         int, typer.Option(min=1, metavar="N", help="Most triangles in a strip.")
     ] = _ORDER.max_length,
+    stripifier: Annotated[
+        str, typer.Option(metavar="NAME", help=f"How strips are made: {', '.join(METHODS)}.")
+    ] = _ORDER.method,
+    effort: Annotated[
+        str,
+        typer.Option(metavar="NAME", help=f"How long strip-rt searches: {', '.join(EFFORT_NAMES)}."),
+    ] = _ORDER.effort,
+    block: Annotated[
+        int | None,
+        typer.Option(
+            min=SMALLEST_BLOCK,
+            max=LARGEST_BLOCK,
+            metavar="N",
+            help="Cut into blocks of at most N triangles and N vertices, and order inside them (strip-rt).",
+            show_default="no blocks",
+        ),
+    ] = _ORDER.block,
     distance_weight: Annotated[
-        float, typer.Option(min=0.0, metavar="W", help="Weight of nearness in the SAH tree when strips join.")
+        float, typer.Option(min=0.0, metavar="W", help="Weight of nearness when strips join (paper).")
     ] = _ORDER.distance_weight,
     balance_weight: Annotated[
-        float, typer.Option(min=0.0, metavar="W", help="Weight of equal lengths when strips join.")
+        float, typer.Option(min=0.0, metavar="W", help="Weight of equal lengths when strips join (paper).")
     ] = _ORDER.balance_weight,
+    strips: Annotated[
+        bool,
+        typer.Option(
+            "--strips", help="Write classic strips: GLB of triangle strips, else faces in their order."
+        ),
+    ] = False,
     threads: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
     ] = None,
@@ -87,16 +120,24 @@ def run(
         bool, typer.Option("-v", "--verbose", help="Add seconds by stage, bytes by part.")
     ] = False,
 ) -> None:
-    """Turn a mesh into a scene file (.rdm), or a scene file back into a mesh.
+    """Turn a mesh into a scene file (.rdm), a scene file back into a mesh, or either into classic strips.
 
     The direction follows from the formats of IN and OUT. Whatever cleaning drops or changes is counted and
     said. Back from a scene, every face that cleaning kept comes out with its winding, in the source's order
-    and from the source's first corner unless the scene was made with --no-remap.
+    and from the source's first corner unless the scene was made with --no-remap. With --strips a mesh or a
+    scene becomes a mesh for rasterisers; --effort, --weld, --drop-duplicates and --threads apply.
     """
     log.set_up(quiet=quiet, verbose=verbose)
     options = Options(
         clean=CleanOptions(weld=weld, drop_duplicates=drop_duplicates),
-        ordering=OrderingOptions(max_length, distance_weight, balance_weight),
+        ordering=OrderingOptions(
+            max_length,
+            cast(Method, stripifier),
+            cast(EffortName, effort),
+            distance_weight,
+            balance_weight,
+            block,
+        ),
         remap=not no_remap,
         threads=threads,
     )
@@ -105,8 +146,12 @@ def run(
     out = Target.open(target, force=force)
     file = Source.open(source)
     read_format = input_format(file, from_format)
-    _check_direction(read_format, write_format, options)
-    job = _to_mesh if read_format == SCENE_FORMAT else _to_scene
+    if strips:
+        _check_strips(read_format, write_format, options)
+        job = _to_strips
+    else:
+        _check_direction(read_format, write_format, options)
+        job = _to_mesh if read_format == SCENE_FORMAT else _to_scene
     outcome = job(file, out, options, (read_format, write_format), quiet)
     if report:
         Target.open(report, force=True).write(lambda file: _write_text(file, render(outcome.facts, "json")))
@@ -127,10 +172,26 @@ def _check_direction(read_format: str, write_format: str, options: Options) -> N
     if from_scene == to_scene:
         raise UsageError(
             "IN and OUT are both scenes" if from_scene else "neither IN nor OUT is a scene",
-            remedy=f"one of them must be .{SCENE_FORMAT}, by its name or by --from or --to",
+            remedy=f"one of them must be .{SCENE_FORMAT}, by its name or by --from or --to"
+            + ("" if from_scene else "; --strips turns a mesh into a mesh of strips"),
         )
     if from_scene and dataclasses.replace(options, threads=None) != Options():
         raise UsageError("an option that shapes a scene, but IN is a scene already", remedy="leave it out")
+
+
+def _check_strips(read_format: str, write_format: str, options: Options) -> None:
+    if write_format == SCENE_FORMAT:
+        raise UsageError(
+            "--strips writes a mesh, but OUT is a scene, which has strips of its own",
+            remedy=f"leave it out, or name one of {', '.join(STRIP_FORMATS)}",
+        )
+    used = Options(
+        clean=options.clean, ordering=OrderingOptions(effort=options.ordering.effort), threads=options.threads
+    )
+    if options != used:
+        raise UsageError("an option that shapes a scene, but --strips writes a mesh", remedy="leave it out")
+    if read_format == SCENE_FORMAT and options.clean != _CLEAN:
+        raise UsageError("an option of cleaning, but IN is a scene, clean already", remedy="leave it out")
 
 
 def _check_names(source: str, target: str, report: str | None) -> None:
@@ -145,7 +206,7 @@ def _check_names(source: str, target: str, report: str | None) -> None:
 def _to_scene(
     source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
 ) -> _Outcome:
-    notice.before_kernels("strip_ordering", quiet=quiet)
+    notice.before_kernels("strip_chunks", quiet=quiet)
     clock = Stopwatch()
     with StageProgress(quiet=quiet) as progress:
         scene, report = convert_with_report(
@@ -188,6 +249,57 @@ def _to_mesh(
     return _Outcome([line], list(_details(seconds, scene)), facts)
 
 
+def _to_strips(
+    source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
+) -> _Outcome:
+    notice.before_kernels("alternating_search", quiet=quiet)
+    threads = options.threads or len(os.sched_getaffinity(0))
+    with StageProgress(quiet=quiet) as progress:
+        clock = Stopwatch(progress.watch)
+        with clock.stage("load"):
+            mesh, changes, counts = _loaded_clean(source, options, formats[0])
+        with clock.stage("order"):
+            export = export_strips(mesh, formats[1], options.ordering.effort, threads)
+        with clock.stage("write"):
+            target.write(export.save)
+    seconds, peak = clock.read()
+    count, strips = export.count, len(export.strips.starts) - 1
+    between = (
+        "stitched by repeated vertices" if formats[1] == "glb" else f"{count.restarts:,} restarts counted"
+    )
+    line = (
+        f"{_arrow(source, target)}, {mesh.triangle_count:,} triangles in {strips:,} strips, "
+        f"{export.indices_per_triangle:.3f} indices per triangle, {between}"
+    )
+    facts = {
+        "seconds": seconds,
+        "peak_bytes": peak,
+        "counts": {
+            **counts,
+            "triangles": mesh.triangle_count,
+            "vertices": mesh.vertex_count,
+            "strips": strips,
+        }
+        | dataclasses.asdict(count),
+        "indices_per_triangle": export.indices_per_triangle,
+    }
+    return _Outcome([line, *changes], list(_stages(seconds)), facts)
+
+
+def _loaded_clean(
+    source: Source, options: Options, read_format: str
+) -> tuple[Mesh, list[str], dict[str, int]]:
+    """A mesh fit for strips, what loading and cleaning have to say, and cleaning's counts."""
+    if read_format == SCENE_FORMAT:
+        return read_scene(source.file).to_mesh(), [], {}
+    mesh = load_mesh(source.file, file_format=read_format or None)
+    cleaned = clean(mesh, options.clean)
+    if cleaned.mesh.triangle_count == 0:
+        raise UnreadableMeshError("no face is left after cleaning", where=source.title)
+    report = Report({}, 0, cleaned.counts, cleaned.largest_rounding, cleaned.weld_error, mesh.notes)
+    return cleaned.mesh, list(_changes(report)), cleaned.counts
+
+
 def _arrow(source: Source, target: Target) -> str:
     return f"{source.title} ({human_bytes(source.size)}) -> {target.title} ({human_bytes(target.size)})"
 
@@ -215,11 +327,15 @@ def _changes(report: Report) -> Iterator[str]:
 
 
 def _details(seconds: dict[str, float], scene: Scene) -> Iterator[str]:
-    for stage, duration in seconds.items():
-        yield f"  {stage:<16}{duration:12.3f} s"
+    yield from _stages(seconds)
     for part, size in scene.part_bytes().items():
         share = size / scene.triangle_count
         yield f"  {part.replace('_', ' '):<16}{size:12,} bytes  {share:8.3f} per triangle"
+
+
+def _stages(seconds: dict[str, float]) -> Iterator[str]:
+    for stage, duration in seconds.items():
+        yield f"  {stage:<16}{duration:12.3f} s"
 
 
 def _ordered(seconds: dict[str, float]) -> dict[str, float]:

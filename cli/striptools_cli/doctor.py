@@ -19,7 +19,8 @@ _REQUIRED = ("numpy", "numba", "llvmlite", "scipy", "networkx", "trimesh", "jaxt
 _EXTRAS = {
     "trace": ("jax", "jaxlib", "pillow"),
     "meshlab": ("pymeshlab",),
-    "peers": ("embreex",),
+    "plots": ("matplotlib",),
+    "peers": ("embreex", "meshoptimizer", "vtk", "PyFFI"),
 }
 
 

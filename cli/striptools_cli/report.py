@@ -1,14 +1,15 @@
 """One record, four shapes: text for people, json and csv for programs, md for reports.
 
 A record is a mapping from names to numbers, strings, booleans, None, lists, or further records. Text groups
-thousands and rounds to four digits; the other shapes give every value in full.
+thousands and rounds to four digits; the other shapes give every value in full. A table is a list of records
+with the same names.
 """
 
 import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Literal
 
 Format = Literal["text", "json", "csv", "md"]
@@ -35,6 +36,34 @@ def render(record: Record, form: Format, title: str = "") -> str:
         "md": _markdown,
     }
     return writers[form](record, title)
+
+
+def render_table(rows: Sequence[Record], form: Format, title: str = "") -> str:
+    """Write records with the same names down as a table, a row each.
+
+    Args:
+        rows: At least one; names and rows keep their order.
+        form: `text`, `json`, `csv` or `md`.
+        title: A heading for text and md; json and csv leave it out.
+
+    Returns:
+        Lines, each ended by a newline.
+    """
+    if form == "json":
+        return json.dumps(_jsonable(list(rows)), indent=2, allow_nan=False) + "\n"
+    names = list(rows[0])
+    cells = [[_plain(row[name]) for name in names] for row in rows]
+    if form == "csv":
+        lines = io.StringIO()
+        csv.writer(lines, lineterminator="\n").writerows([names, *([_cell(c) for c in row] for row in cells)])
+        return lines.getvalue()
+    if form == "md":
+        heading = [f"## {_escaped(title)}", ""] if title else []
+        table = [names, ["---"] * len(names), *([_cell(c) for c in row] for row in cells)]
+        table = [f"| {' | '.join(_escaped(cell) for cell in row)} |" for row in table]
+        return "".join(f"{line}\n" for line in [*heading, *table])
+    heads = [name.replace("_", " ") for name in names]
+    return _text_table([heads, *([human_value(c) for c in row] for row in cells)], title)
 
 
 def human_bytes(count: int) -> str:
@@ -88,6 +117,16 @@ def _text_rows(record: Record, indent: str) -> Iterator[tuple[str, str]]:
             yield from _text_rows(value, indent + "  ")
         else:
             yield label, human_value(value)
+
+
+def _text_table(rows: list[list[str]], title: str) -> str:
+    """Columns as wide as they need: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [title] if title else []
+    for first, *rest in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(rest, widths[1:], strict=True)]
+        lines.append("  ".join([f"  {first:<{widths[0]}}", *cells]).rstrip())
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _json(record: Record, _title: str) -> str:

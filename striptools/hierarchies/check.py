@@ -35,12 +35,12 @@ def strip_hierarchy_flaw(hierarchy: StripHierarchy, strip_boxes: Boxes) -> tuple
     left = hierarchy.left_count
     if len(left) != strips - 1 or hierarchy.boxes.shape != (strips - 1, 6):
         return WRONG_SIZE, 0
-    first, count, broken = strip_ranges(left, strips)
-    if broken >= 0:
-        return EMPTY_CHILD, int(broken)
     node = _first(np.logical_not(np.isfinite(hierarchy.boxes).all(axis=1)))
     if node >= 0:
         return NOT_FINITE, node
+    first, count, broken = strip_ranges(left, strips)
+    if broken >= 0:
+        return EMPTY_CHILD, int(broken)
     places, lefts = np.arange(strips - 1), left.astype(np.int64)
     node = _first(
         _spills(hierarchy, strip_boxes, places + 1, lefts, first)

@@ -97,7 +97,7 @@ def ring_half_edges(faces, vertex_count):
     row = np.empty(64, np.int32)
 
     # Walk the runs of half-edges of one undirected edge.
-    begin = 0
+    begin = np.int64(0)
     while begin < half_edges:
         face = order[begin] // 3
         slot = order[begin] - 3 * face

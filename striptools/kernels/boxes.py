@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
     """Half the surface area in float64: finite float32 boxes cannot overflow it."""
     x = np.float64(hi_x) - np.float64(lo_x)
@@ -14,21 +14,28 @@ def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
 
 
 @njit(cache=True, nogil=True)
-def face_boxes(positions, faces, boxes):
-    """Fill boxes (n, 6) with the bounds of each face's three corners."""
-    for face in range(faces.shape[0]):
-        # Start from the first corner.
+def face_boxes(positions, faces, begin, end, boxes):
+    """Fill boxes (n, 6) with the bounds of the three corners of the faces `begin:end`."""
+    for face in range(begin, end):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         for axis in range(3):
-            boxes[face, axis] = positions[faces[face, 0], axis]
-            boxes[face, 3 + axis] = positions[faces[face, 0], axis]
-        # Grow by the other two.
-        for corner in range(1, 3):
+            one, two, three = positions[a, axis], positions[b, axis], positions[c, axis]
+            boxes[face, axis] = min(min(one, two), three)
+            boxes[face, 3 + axis] = max(max(one, two), three)
+
+
+@njit(cache=True, nogil=True)
+def range_boxes(boxes, items, starts, out):
+    """Fill out (s, 6) with the box around each range `items[starts[i] : starts[i + 1]]`, none empty."""
+    for part in range(starts.shape[0] - 1):
+        # Start from the first box and grow by the others.
+        for k in range(6):
+            out[part, k] = boxes[items[starts[part]], k]
+        for place in range(starts[part] + 1, starts[part + 1]):
+            item = items[place]
             for axis in range(3):
-                value = positions[faces[face, corner], axis]
-                if value < boxes[face, axis]:
-                    boxes[face, axis] = value
-                if value > boxes[face, 3 + axis]:
-                    boxes[face, 3 + axis] = value
+                out[part, axis] = min(out[part, axis], boxes[item, axis])
+                out[part, 3 + axis] = max(out[part, 3 + axis], boxes[item, 3 + axis])
 
 
 @njit(cache=True, nogil=True)

@@ -19,9 +19,12 @@ between 2^-298 and 2^258.
 
 
 @njit(cache=True, nogil=True)
-def classify_faces(positions, faces, verdict):
-    """Write one of the constants above to `verdict`, `(n,)` uint8, for each face of float32 `positions`."""
-    for face in range(faces.shape[0]):
+def classify_faces(positions, faces, begin, end, verdict):
+    """Write one of the constants above to `verdict`, `(n,)` uint8, for the faces `begin:end`.
+
+    `positions` are float32.
+    """
+    for face in range(begin, end):
         a = faces[face, 0]
         b = faces[face, 1]
         c = faces[face, 2]

@@ -4,21 +4,59 @@ Sets of slots are bit masks (bit k for slot k). Slot k of a face is its edge fro
 % 3.
 """
 
+import numpy as np
 from numba import njit
 
 ALL_SLOTS = 7
 
 
-@njit(cache=True, nogil=True)
-def meeting_slot(faces, t, leave, u):
-    """The set of slots of face u that run slot `leave` of face t in the opposite direction."""
-    a = faces[t, leave]
-    b = faces[t, (leave + 1) % 3]
-    met = 0
-    for slot in range(3):
-        if faces[u, slot] == b and faces[u, (slot + 1) % 3] == a:
-            met |= 1 << slot
-    return met
+def _usable_crossings(entered):
+    """Which of the nine crossings may be taken out of a face entered by one of a set of slots.
+
+    A face is never left by the slot it was entered by; with two slots to choose from, or none (the first face
+    of a strip), every crossing stays possible.
+    """
+    rows = [0 if entered == 1 << leave else ALL_SLOTS << 3 * leave for leave in range(3)]
+    return sum(rows)
+
+
+def _entries_before(leaving):
+    """The slots by which a face may be entered that has to be left by one of a set of slots."""
+    return sum(
+        {1 << entry for entry in range(3) for leave in range(3) if leaving >> leave & 1 and leave != entry}
+    )
+
+
+LEAST_SLOT = np.array([3, 0, 1, 0, 2, 0, 1, 0], np.uint8)
+"""The least slot of each set; 3 for the empty one."""
+
+USABLE = np.array([_usable_crossings(entered) for entered in range(8)], np.int64)
+ENTRIES_BEFORE = np.array([_entries_before(leaving) for leaving in range(8)], np.int64)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def crossings(faces, t, u):
+    """The ways from face t to face u, edges run in opposite directions: a set of bits 3 * leave + enter."""
+    a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+    x, y, z = faces[u, 0], faces[u, 1], faces[u, 2]
+    ways = 0
+    ways |= ((x == b) & (y == a)) << 0 | ((y == b) & (z == a)) << 1 | ((z == b) & (x == a)) << 2
+    ways |= ((x == c) & (y == b)) << 3 | ((y == c) & (z == b)) << 4 | ((z == c) & (x == b)) << 5
+    ways |= ((x == a) & (y == c)) << 6 | ((y == a) & (z == c)) << 7 | ((z == a) & (x == c)) << 8
+    return ways
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def slots_entered(ways):
+    """The slots of the second face that a set of crossings enters by."""
+    return (ways | ways >> 3 | ways >> 6) & ALL_SLOTS
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def slots_left(ways, entered):
+    """The slots of the first face by which a set of crossings comes to slot `entered` of the second."""
+    ways >>= entered
+    return ways & 1 | ways >> 2 & 2 | ways >> 4 & 4
 
 
 @njit(cache=True, nogil=True)
@@ -28,78 +66,121 @@ def slots_after(faces, t, entered, u):
     A face is never left by the slot it was entered by. An empty set, 0, stands for a face that starts a
     strip.
     """
-    reached = 0
-    for leave in range(3):
-        if entered == 0 or entered & ~(1 << leave):
-            reached |= meeting_slot(faces, t, leave, u)
-    return reached
+    return slots_entered(crossings(faces, t, u) & USABLE[entered])
 
 
 @njit(cache=True, nogil=True)
-def choose_entries(faces, order, starts, entries):
-    """Fill entries (n,) uint8 with the slot each face is entered by (3 for the first of a strip).
+def longest_strip(starts, first, last):
+    """The most faces of the strips `first:last`, at least 1."""
+    longest = 1
+    for strip in range(first, last):
+        longest = max(longest, starts[strip + 1] - starts[strip])
+    return longest
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def gather_strip(faces, order, begin, end, rows):
+    """Copy the faces `order[begin:end]` to rows, where the passes that follow find them in order."""
+    for k in range(begin, end):
+        for corner in range(3):
+            rows[k - begin, corner] = faces[order[k], corner]
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def choose_strip(rows, count, ways, entries):
+    """Fill entries (count,) with the slot each row is entered by, 3 for the first; ways with all crossings.
 
     Faces that share more than one edge leave a choice; the one of least slots from the strip's end backwards
-    is taken. Returns the first position that its predecessor cannot lead to, -1 where all can.
+    is taken. Returns the first row that its predecessor cannot lead to, -1 where all can.
     """
+    # Go forward with the sets of slots each face can be entered by.
+    reached = 0
+    broken = -1
+    for k in range(1, count):
+        ways[k] = crossings(rows, k - 1, k)
+        reached = slots_entered(ways[k] & USABLE[reached])
+        entries[k] = reached
+        if reached == 0 and broken < 0:
+            broken = k
+    # Go back and keep one slot of each set, such that the face before can be left to it.
+    wanted = ALL_SLOTS
+    for k in range(count - 1, 0, -1):
+        slot = np.int64(LEAST_SLOT[entries[k] & wanted])
+        entries[k] = slot
+        wanted = ENTRIES_BEFORE[slots_left(ways[k], slot)]
+    entries[0] = 3
+    return broken
+
+
+@njit(cache=True, nogil=True)
+def first_break(faces, order, starts):
+    """The first position of any strip that its predecessor cannot lead to, -1 where all can."""
+    longest = longest_strip(starts, 0, starts.shape[0] - 1)
+    rows = np.empty((longest, 3), np.int32)
+    ways = np.empty(longest, np.int64)
+    entries = np.empty(longest, np.int64)
     for strip in range(starts.shape[0] - 1):
-        begin = starts[strip]
-        end = starts[strip + 1]
-        # Go forward with the sets of slots each face can be entered by.
-        reached = 0
-        entries[begin] = 0
-        for k in range(begin + 1, end):
-            reached = slots_after(faces, order[k - 1], reached, order[k])
-            if reached == 0:
-                return k
-            entries[k] = reached
-        # Go back and keep one slot of each set, such that the face before can be left to it.
-        wanted = ALL_SLOTS
-        for k in range(end - 1, begin, -1):
-            kept = entries[k] & wanted
-            slot = 0
-            while not kept >> slot & 1:
-                slot += 1
-            entries[k] = slot
-            # The face before must be entered by another slot than one it can be left by to here.
-            wanted = 0
-            for leave in range(3):
-                if meeting_slot(faces, order[k - 1], leave, order[k]) >> slot & 1:
-                    wanted |= ALL_SLOTS ^ (1 << leave)
-        entries[begin] = 3
+        gather_strip(faces, order, starts[strip], starts[strip + 1], rows)
+        broken = choose_strip(rows, starts[strip + 1] - starts[strip], ways, entries)
+        if broken >= 0:
+            return starts[strip] + broken
     return -1
 
 
 @njit(cache=True, nogil=True)
-def leaving_slot(faces, t, entry, u, entered):
-    """The least slot of face t, not its entry, that slot `entered` of face u runs against."""
-    for slot in range(3):
-        if slot != entry and meeting_slot(faces, t, slot, u) >> entered & 1:
-            return slot
-    return 3
+def encode(faces, order, starts, first, last, vertices, turns, rotation):
+    """Fill vertices (n + 2s,), turns (n,) and rotation (n,) of the strips `first:last`.
+
+    Returns the first position that its predecessor cannot lead to, -1 where all can.
+    """
+    longest = longest_strip(starts, first, last)
+    rows = np.empty((longest, 3), np.int32)
+    ways = np.empty(longest, np.int64)
+    entries = np.empty(longest, np.int64)
+    for strip in range(first, last):
+        # Find the slots by which the faces are entered.
+        begin = starts[strip]
+        count = starts[strip + 1] - begin
+        place = begin + 2 * strip
+        gather_strip(faces, order, begin, begin + count, rows)
+        broken = choose_strip(rows, count, ways, entries)
+        if broken >= 0:
+            return begin + broken
+
+        # Turn the first face so that the strip leaves it by the edge from corner 1 to corner 2.
+        turn = 0
+        if count > 1:
+            turn = (LEAST_SLOT[slots_left(ways[1], entries[1])] + 2) % 3
+        for corner in range(3):
+            vertices[place + corner] = rows[0, (corner + turn) % 3]
+        rotation[begin] = turn
+        turns[begin] = False
+        for k in range(1, count):
+            # Corner 0 of the running triangle is where its entry slot starts; the new vertex is the third.
+            entry = entries[k]
+            vertices[place + 2 + k] = rows[k, (entry + 2) % 3]
+            # The face before is left by the slot one (no bit) or two (bit) places after its own first corner.
+            leave = LEAST_SLOT[slots_left(ways[k], entry) & ~(1 << entries[k - 1])]
+            turns[begin + k] = (leave + 3 - turn) % 3 == 2
+            rotation[begin + k] = entry
+            turn = entry
+    return -1
 
 
 @njit(cache=True, nogil=True)
-def encode(faces, order, starts, entries, vertices, turns, rotation):
-    """Fill vertices (n + 2s,), turns (n,) and rotation (n,) from sequences and entry slots."""
-    for strip in range(starts.shape[0] - 1):
+def decode(vertices, turns, starts, first, last, faces):
+    """Fill faces (n, 3) with the triangles of strips `first:last`."""
+    for strip in range(first, last):
+        # The first triangle is the first three vertices.
         begin = starts[strip]
-        end = starts[strip + 1]
         place = begin + 2 * strip
-        # Turn the first face so that the strip leaves it by the edge from corner 1 to corner 2.
-        first = order[begin]
-        turn = 0
-        if end - begin > 1:
-            turn = (leaving_slot(faces, first, 3, order[begin + 1], entries[begin + 1]) + 2) % 3
-        for corner in range(3):
-            vertices[place + corner] = faces[first, (corner + turn) % 3]
-        rotation[begin] = turn
-        turns[begin] = False
-        for k in range(begin + 1, end):
-            # Corner 0 of the running triangle is where its entry slot starts; the new vertex is the third.
-            face = order[k]
-            rotation[k] = entries[k]
-            vertices[place + 2 + k - begin] = faces[face, (entries[k] + 2) % 3]
-            # The face before is left by the slot one (no bit) or two (bit) places after its own first corner.
-            leave = leaving_slot(faces, order[k - 1], entries[k - 1], face, entries[k])
-            turns[k] = (leave + 3 - rotation[k - 1]) % 3 == 2
+        a, b, c = vertices[place], vertices[place + 1], vertices[place + 2]
+        faces[begin, 0], faces[begin, 1], faces[begin, 2] = a, b, c
+        # Each other one has the newest vertex and, by its bit, one of the two before it.
+        for k in range(begin + 1, starts[strip + 1]):
+            if turns[k]:
+                b = c
+            else:
+                a, b = c, b
+            c = vertices[place + 2 + k - begin]
+            faces[k, 0], faces[k, 1], faces[k, 2] = a, b, c

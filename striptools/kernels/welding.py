@@ -4,6 +4,9 @@ import numpy as np
 from numba import njit
 
 LOW_WORD = np.uint64(0xFFFFFFFF)
+NEAR_PROBES = 6
+"""How often the neighbourhood of a face's least vertex is probed before a slot far from it."""
+
 SMALLEST_CELL = 1e-44
 """In the unit of the points: a finer grid than float32 would overflow and tell nothing more apart."""
 
@@ -27,22 +30,55 @@ def mix_bits(a, b, c):
 
 
 @njit(cache=True, nogil=True)
-def first_equal_rows(words):
-    """For each row of `words`, `(n, 3)` uint32, the index of the first row equal to it, `(n,)` int32."""
-    rows = words.shape[0]
+def table_size(rows):
+    """A power of two of at least twice so many rows."""
     slots = 16
     while slots < 2 * rows:
         slots *= 2
-    mask = np.uint64(slots - 1)
-    table = np.full(slots, -1, np.int32)
-    first = np.empty(rows, np.int32)
+    return slots
+
+
+@njit(cache=True, nogil=True)
+def part_of(mixed, parts):
+    """Which of `parts` a hash belongs to, by its high bits: the low ones choose the slot."""
+    return np.int64(mixed >> np.uint64(16)) * parts >> 16
+
+
+@njit(cache=True, nogil=True)
+def first_equal_rows(words, part, parts, first):
+    """Note the first equal row of each row of `words`, `(n, 3)` uint32, of one part by hash.
+
+    Equal rows are of one part, so that all parts together note the same for any number of parts.
+
+    Args:
+        words: The rows.
+        part: Which part, 0 to parts - 1.
+        parts: How many parts there are.
+        first: `(n,)` int32 to fill for the rows of the part.
+
+    Returns:
+        How many rows of the part have an equal one before them.
+    """
+    # Count the rows of the part, for a table of the right size.
+    rows = words.shape[0]
+    mine = rows
+    if parts > 1:
+        mine = 0
+        for row in range(rows):
+            mine += 1 if part_of(mix_bits(words[row, 0], words[row, 1], words[row, 2]), parts) == part else 0
+    mask = np.uint64(table_size(mine) - 1)
+    table = np.full(np.int64(mask) + 1, -1, np.int32)
+    repeats = 0
     for row in range(rows):
         a = words[row, 0]
         b = words[row, 1]
         c = words[row, 2]
+        mixed = mix_bits(a, b, c)
+        if part_of(mixed, parts) != part:
+            continue
 
         # Probe from the row's own slot until an equal row or a free slot is found.
-        slot = mix_bits(a, b, c) & mask
+        slot = mixed & mask
         known = table[slot]
         while known >= 0 and (words[known, 0] != a or words[known, 1] != b or words[known, 2] != c):
             slot = (slot + np.uint64(1)) & mask
@@ -51,7 +87,79 @@ def first_equal_rows(words):
             table[slot] = row
             known = row
         first[row] = known
-    return first
+        repeats += 1 if known != row else 0
+    return repeats
+
+
+@njit(cache=True, nogil=True)
+def least_first(faces, face):
+    """The corners of a face, turned so that the least comes first."""
+    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    if b < a and b < c:
+        return b, c, a
+    if c < a and c < b:
+        return c, a, b
+    return a, b, c
+
+
+@njit(cache=True, nogil=True)
+def mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated):
+    """Mark the kept faces that repeat an earlier kept one up to rotation, of one part by least vertex.
+
+    Args:
+        faces: `(n, 3)` int32, no vertex twice in a kept face.
+        keep: `(n,)` bool.
+        vertex_count: How many vertices there are.
+        part: Which part, 0 to parts - 1.
+        parts: How many parts there are.
+        repeated: `(n,)` bool, all False, to fill for the faces of the part.
+    """
+    # Count the faces of the part, for a table of the right size.
+    begin = vertex_count * part // parts
+    end = vertex_count * (part + 1) // parts
+    mine = np.int64(0)
+    for face in range(faces.shape[0]):
+        least = min(min(faces[face, 0], faces[face, 1]), faces[face, 2])
+        mine += 1 if begin <= least < end else 0
+    slots = table_size(mine)
+    mask = slots - 1
+    table = np.full(slots, -1, np.int32)
+    spread = max(1, slots // max(1, end - begin))
+    for face in range(faces.shape[0]):
+        a, b, c = least_first(faces, face)
+        if not (begin <= a < end and keep[face]):
+            continue
+
+        # Probe near the place of the least vertex first, where neighbours in the mesh are neighbours in the
+        # table; then, a fan may be large, from a slot that all three choose.
+        slot = (a - begin) * spread & mask
+        known = table[slot]
+        probes = 1
+        while known >= 0 and (a, b, c) != least_first(faces, known):
+            slot = slot + 1 if probes != NEAR_PROBES else np.int64(mix_bits(a, b, c))
+            slot &= mask
+            known = table[slot]
+            probes += 1
+        if known < 0:
+            table[slot] = face
+        else:
+            repeated[face] = True
+
+
+@njit(cache=True, nogil=True)
+def mark_used(faces, begin, end, used):
+    """Mark the vertices of the faces `begin:end`; threads that mark the same vertex write the same."""
+    for face in range(begin, end):
+        for corner in range(3):
+            used[faces[face, corner]] = True
+
+
+@njit(cache=True, nogil=True)
+def renumber_faces(faces, place, begin, end):
+    """Put the vertices of the faces `begin:end` in their new places."""
+    for face in range(begin, end):
+        for corner in range(3):
+            faces[face, corner] = place[faces[face, corner]]
 
 
 @njit(cache=True, nogil=True)

@@ -30,6 +30,7 @@ import numpy as np
 
 from striptools.errors import UsageError
 from striptools.mesh.mesh import Mesh
+from striptools.threads import in_chunks, in_parts
 from striptools.types import FaceIds, Faces, Positions, SourcePositions
 
 CHUNK = 1 << 16
@@ -88,8 +89,11 @@ class Cleaned:
 DEFAULT_OPTIONS = CleanOptions()
 
 
-def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS) -> Cleaned:
+def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS, threads: int = 1) -> Cleaned:
     """Round, weld and drop as the module's head says; the mesh may come out empty, and its counts say why.
+
+    The result is the same for any number of threads. What needs no change is not copied: the cleaned mesh may
+    share arrays with `mesh`.
 
     Raises:
         UsageError: Where `options` are out of range.
@@ -97,17 +101,21 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS) -> Cleaned:
     from striptools.kernels.degenerate import USABLE
 
     positions, largest_rounding = round_positions(mesh.positions)
-    leader, weld_error = weld_vertices(positions, options.weld)
-    welded = int(np.count_nonzero(leader != np.arange(len(leader), dtype=np.int32)))
+    leader, weld_error = weld_vertices(positions, options.weld, threads)
+    welded = _followers(leader)
     faces = leader[mesh.faces] if welded else mesh.faces
-    verdict = judge_faces(positions, faces)
+    del leader
+    verdict = judge_faces(positions, faces, threads)
     keep = verdict == USABLE
     counts = {"faces_in": len(faces), **_count_reasons(verdict)}
-    repeats = _drop_repeats(faces, keep, really=options.drop_duplicates)
+    repeated = _repeated_faces(faces, keep, len(positions), threads)
+    repeats = int(np.count_nonzero(repeated))
+    if options.drop_duplicates:
+        keep &= ~repeated
     source_face = np.flatnonzero(keep).astype(np.int32)
-    kept_faces = faces[source_face]
-    del faces, verdict, keep
-    used, kept_faces = _renumber(kept_faces, len(positions))
+    kept_faces = faces if len(source_face) == len(faces) else faces[source_face]
+    del faces, verdict, keep, repeated
+    used, kept_faces = _renumber(kept_faces, len(positions), threads)
     vertices_out = int(np.count_nonzero(used))
     counts |= {
         "duplicate_faces_dropped": repeats if options.drop_duplicates else 0,
@@ -118,7 +126,7 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS) -> Cleaned:
         "vertices_welded": welded,
         "vertices_unreferenced": len(positions) - welded - vertices_out,
     }
-    cleaned = Mesh(positions if used.all() else positions[used], kept_faces, mesh.notes)
+    cleaned = Mesh(positions if vertices_out == len(positions) else positions[used], kept_faces, mesh.notes)
     return Cleaned(cleaned, source_face, counts, largest_rounding, weld_error)
 
 
@@ -137,22 +145,25 @@ def round_positions(positions: SourcePositions) -> tuple[Positions, float]:
     return rounded, largest
 
 
-def weld_vertices(positions: Positions, distance: float = 0.0) -> tuple[FaceIds, float]:
+def weld_vertices(positions: Positions, distance: float = 0.0, threads: int = 1) -> tuple[FaceIds, float]:
     """The vertex that stands for each vertex, `(v,)` int32, and the farthest that one moves by it.
 
     Args:
         positions: `(v, 3)` float32.
         distance: 0 for bit-equal vertices only, else the tolerance, as in `CleanOptions.weld`.
+        threads: How many threads share the work where the distance is 0.
     """
     from striptools.kernels.welding import first_equal_rows, nearest_leaders
 
     if distance == 0.0:
-        return first_equal_rows(positions.view(np.uint32)), 0.0
+        words, leader = positions.view(np.uint32), np.zeros(len(positions), np.int32)
+        in_parts(lambda part, parts: first_equal_rows(words, part, parts, leader), len(words), threads)
+        return leader, 0.0
     leader, farthest = nearest_leaders(positions, distance)
     return leader, float(farthest)
 
 
-def judge_faces(positions: Positions, faces: Faces) -> np.ndarray:
+def judge_faces(positions: Positions, faces: Faces, threads: int = 1) -> np.ndarray:
     """The verdict on each face, `(n,)` uint8 by the constants of `striptools.kernels.degenerate`.
 
     A face left `DOUBTFUL` is proved to have zero area.
@@ -160,7 +171,7 @@ def judge_faces(positions: Positions, faces: Faces) -> np.ndarray:
     from striptools.kernels.degenerate import DOUBTFUL, USABLE, classify_faces
 
     verdict = np.zeros(len(faces), np.uint8)
-    classify_faces(positions, faces, verdict)
+    in_chunks(lambda part: classify_faces(positions, faces, *part, verdict), len(faces), threads)
     doubtful = np.flatnonzero(verdict == DOUBTFUL)
     for begin in range(0, len(doubtful), CHUNK):
         part = doubtful[begin : begin + CHUNK]
@@ -226,32 +237,34 @@ def _count_reasons(verdict: np.ndarray) -> dict[str, int]:
     return {reason: int(np.count_nonzero(verdict == code)) for reason, code in codes.items()}
 
 
-def _drop_repeats(faces: Faces, keep: np.ndarray, *, really: bool) -> int:
-    """Count the kept faces that repeat an earlier one up to rotation; take them out of `keep` if `really`."""
-    from striptools.kernels.welding import first_equal_rows
-
-    kept = np.flatnonzero(keep)
-    turned = _least_vertex_first(faces[kept])
-    repeated = first_equal_rows(turned.view(np.uint32)) != np.arange(len(kept), dtype=np.int32)
-    if really:
-        keep[kept[repeated]] = False
-    return int(np.count_nonzero(repeated))
+def _followers(leader: FaceIds) -> int:
+    """How many vertices are led by another one."""
+    return int(np.count_nonzero(leader != np.arange(len(leader), dtype=np.int32)))
 
 
-def _least_vertex_first(faces: Faces) -> Faces:
-    """Each row turned so that its least vertex comes first; `faces` is overwritten."""
-    for corner in (1, 2):
-        turn = (faces[:, corner] < faces[:, 0]) & (faces[:, corner] < faces[:, 3 - corner])
-        faces[turn] = np.roll(faces[turn], -corner, axis=1)
-    return faces
+def _repeated_faces(faces: Faces, keep: np.ndarray, vertex_count: int, threads: int) -> np.ndarray:
+    """Which kept faces repeat an earlier kept one up to rotation, `(n,)` bool."""
+    from striptools.kernels.welding import mark_repeated_faces
+
+    repeated = np.zeros(len(faces), np.bool_)
+    in_parts(
+        lambda part, parts: mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated),
+        len(faces),
+        threads,
+    )
+    return repeated
 
 
-def _renumber(faces: Faces, vertex_count: int) -> tuple[np.ndarray, Faces]:
+def _renumber(faces: Faces, vertex_count: int, threads: int) -> tuple[np.ndarray, Faces]:
     """Which vertices `faces` use, and `faces` in the numbering of those alone."""
-    used = np.zeros(vertex_count, bool)
-    used[faces.reshape(-1)] = True
+    from striptools.kernels.welding import mark_used, renumber_faces
+
+    used = np.zeros(vertex_count, np.bool_)
+    in_chunks(lambda part: mark_used(faces, *part, used), len(faces), threads)
     if used.all():
         return used, faces
     place = np.cumsum(used, dtype=np.int32)
     place -= 1
-    return used, place[faces]
+    faces = faces.copy()
+    in_chunks(lambda part: renumber_faces(faces, place, *part), len(faces), threads)
+    return used, faces

@@ -26,6 +26,8 @@ TRIANGLE_COST = 1.0
 
 LARGEST_BINS = 64
 LARGEST_SWEEP = 64
+SMALLEST_BLOCK = 4
+LARGEST_BLOCK = 65536
 
 
 @dataclass(frozen=True)
@@ -35,16 +37,26 @@ class PartitionOptions:
     Attributes:
         bins: Bins an axis in the binned search of large ranges, 2 to 64.
         sweep_below: Ranges of fewer items than this are swept exactly, 2 to 64 (2 sweeps none).
+        block: Split ranges of a few times so many items such that blocks of at most that many, cut from the
+            tree, are well filled; 4 to 65536. None for no blocks.
     """
 
     bins: int = 16
     sweep_below: int = 13
+    block: int | None = None
 
     def __post_init__(self) -> None:
         _require(2 <= self.bins <= LARGEST_BINS, "bins", self.bins, f"2 to {LARGEST_BINS}")
         _require(
             2 <= self.sweep_below <= LARGEST_SWEEP, "sweep_below", self.sweep_below, f"2 to {LARGEST_SWEEP}"
         )
+        if self.block is not None:
+            _require(
+                SMALLEST_BLOCK <= self.block <= LARGEST_BLOCK,
+                "block",
+                self.block,
+                f"{SMALLEST_BLOCK} to {LARGEST_BLOCK}",
+            )
 
 
 def half_area(boxes: Boxes) -> Doubles:

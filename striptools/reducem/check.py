@@ -6,12 +6,16 @@ import numpy as np
 
 from striptools.errors import LimitError, UsageError
 from striptools.hierarchies import check as hierarchy_check
+from striptools.kernels import scene as kernels
 from striptools.reducem.issues import unreadable
 from striptools.reducem.layout import SOURCE_FACE_LIMIT, TRIANGLE_LIMIT
 from striptools.reducem.scene import Scene
-from striptools.types import Boxes
+from striptools.types import Boxes, FaceIds
 
 __all__ = ["check_limits", "check_scene", "strip_boxes"]
+
+LARGEST_SHARE = 8
+"""Source faces per triangle up to which a table of the source's faces is made: a byte each."""
 
 _HIERARCHY_CODES = {
     hierarchy_check.WRONG_SIZE: "RDM114",
@@ -66,9 +70,10 @@ def strip_boxes(scene: Scene) -> Boxes:
     Returns:
         (s, 6) float32.
     """
-    corners = scene.positions[scene.vertices]
-    first = scene.starts[:-1].astype(np.int64) + 2 * np.arange(scene.strip_count)
-    return np.hstack([np.minimum.reduceat(corners, first), np.maximum.reduceat(corners, first)])
+    boxes = np.zeros((scene.strip_count, 6), np.float32)
+    positions, vertices = np.ascontiguousarray(scene.positions), np.ascontiguousarray(scene.vertices)
+    kernels.strip_boxes(positions, vertices, scene.starts, 0, scene.strip_count, boxes)
+    return boxes
 
 
 def _check_dtypes(scene: Scene) -> None:
@@ -113,24 +118,18 @@ def _check_strips(scene: Scene, where: str) -> None:
 
 
 def _check_vertices(scene: Scene, where: str) -> None:
-    vertices = scene.vertices
-    stray = np.flatnonzero(~np.isfinite(scene.positions).all(axis=1))
-    if len(stray):
-        raise unreadable("RDM301", f"{where}: POSN: position {stray[0]}")
-    outside = np.flatnonzero((vertices < 0) | (vertices >= scene.vertex_count))
-    if len(outside):
-        raise unreadable("RDM305", f"{where}: SVTX: entry {outside[0]}")
-    # A vertex that is new is one more than the largest before it.
-    largest = np.maximum.accumulate(vertices)
-    early = np.flatnonzero(vertices[1:] > largest[:-1] + 1)
-    if vertices[0] != 0 or len(early):
-        raise unreadable("RDM306", f"{where}: SVTX: entry {early[0] + 1 if len(early) else 0}")
-    if largest[-1] != scene.vertex_count - 1:
-        raise unreadable("RDM307", f"{where}: POSN: position {largest[-1] + 1}")
-    a, b, c = scene.faces().T
-    repeated = np.flatnonzero((a == b) | (b == c) | (c == a))
-    if len(repeated):
-        raise unreadable("RDM308", f"{where}: SVTX: triangle {repeated[0]}")
+    stray = kernels.first_row_not_finite(scene.positions, 0, scene.vertex_count)
+    if stray >= 0:
+        raise unreadable("RDM301", f"{where}: POSN: position {stray}")
+    flaw, entry, largest = kernels.first_vertex_flaw(scene.vertices, scene.vertex_count)
+    if flaw:
+        code = "RDM305" if flaw == kernels.OUTSIDE else "RDM306"
+        raise unreadable(code, f"{where}: SVTX: entry {entry}")
+    if largest != scene.vertex_count - 1:
+        raise unreadable("RDM307", f"{where}: POSN: position {largest + 1}")
+    repeated = kernels.first_repeated_corner(scene.faces(), 0, scene.triangle_count)
+    if repeated >= 0:
+        raise unreadable("RDM308", f"{where}: SVTX: triangle {repeated}")
 
 
 def _check_remap(scene: Scene, where: str) -> None:
@@ -145,7 +144,13 @@ def _check_remap(scene: Scene, where: str) -> None:
     outside = np.flatnonzero((face < 0) | (face >= scene.source_face_count))
     if len(outside):
         raise unreadable("RDM502", f"{where}: RMAP: triangle {outside[0]}")
-    # Sorted, not counted in a table: a table's size would be the file's word, not its length.
-    ordered = np.sort(face)
-    if (ordered[1:] == ordered[:-1]).any():
+    if _has_repeat(face, scene.source_face_count):
         raise unreadable("RDM503", f"{where}: RMAP")
+
+
+def _has_repeat(face: FaceIds, source_face_count: int) -> bool:
+    # A table's size is the file's word, not its length: where that is far more, faces are sorted instead.
+    if source_face_count <= LARGEST_SHARE * len(face):
+        return bool(kernels.has_repeat(face, np.zeros(source_face_count, np.bool_)))
+    ordered = np.sort(face)
+    return bool((ordered[1:] == ordered[:-1]).any())

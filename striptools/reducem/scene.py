@@ -9,6 +9,7 @@ import numpy as np
 from striptools.hierarchies.strip_bvh import StripHierarchy
 from striptools.mesh.mesh import Mesh
 from striptools.strips.topology import Strips, decode_strips
+from striptools.threads import in_chunks
 from striptools.types import Bools, Counts, FaceIds, Faces, Positions, Rotations
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ def scene_from_strips(
     source_face: FaceIds | None,
     source_face_count: int,
     error_bound: float = 0.0,
+    threads: int = 1,
 ) -> Scene:
     """Put a scene together, with its vertices in the order of their first use.
 
@@ -153,14 +155,24 @@ def scene_from_strips(
         source_face: (n,) int32, the source's face for each face of the cleaned mesh; None for no remap.
         source_face_count: Faces of the source mesh.
         error_bound: See `Scene`.
+        threads: How many threads share the work; the scene is the same for any number.
 
     Returns:
         The scene.
     """
+    from striptools.kernels import scene as kernels
+
     used, vertices = _by_first_use(strips.vertices, len(positions))
-    remap = None if source_face is None else Remap(source_face[strips.source_face], strips.rotation)
+    ordered = np.zeros((len(used), 3), np.float32)
+    in_chunks(lambda part: kernels.gather_rows(positions, used, *part, ordered), len(used), threads)
+    remap = None
+    if source_face is not None:
+        face = np.zeros(len(strips.source_face), np.int32)
+        order = strips.source_face
+        in_chunks(lambda part: kernels.gather_items(source_face, order, *part, face), len(face), threads)
+        remap = Remap(face, strips.rotation)
     return Scene(
-        positions=np.ascontiguousarray(positions[used]),
+        positions=ordered,
         vertices=vertices,
         turns=strips.turns,
         starts=strips.starts,
@@ -172,10 +184,10 @@ def scene_from_strips(
 
 
 def _by_first_use(vertices: Counts, vertex_count: int) -> tuple[Counts, Counts]:
-    never = len(vertices)
-    first_use = np.full(vertex_count, never, np.int32)
-    first_use[vertices[::-1]] = np.arange(never - 1, -1, -1, dtype=np.int32)
-    used = vertices[np.sort(first_use[first_use < never])]
-    number = np.zeros(vertex_count, np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    return used, number[vertices]
+    """The vertices in the order of their first use, and the strip vertices by that numbering."""
+    from striptools.kernels.scene import renumber_by_first_use
+
+    place = np.full(vertex_count, -1, np.int32)
+    numbered, used = np.zeros(len(vertices), np.int32), np.zeros(vertex_count, np.int32)
+    count = renumber_by_first_use(vertices, place, numbered, used)
+    return used[:count], numbered

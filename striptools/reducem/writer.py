@@ -93,7 +93,7 @@ def _table_end(sections: int) -> int:
     return layout.aligned(layout.HEADER.size + sections * layout.ENTRY.size)
 
 
-def _chunks(scene: Scene) -> Iterator[bytes]:
+def _chunks(scene: Scene) -> Iterator[bytes | memoryview]:
     payloads = {kind: payload for kind, payload in _payloads(scene).items() if payload}
     head = _head(payloads)
     yield head + bytes(_table_end(len(payloads)) - len(head))
@@ -102,17 +102,22 @@ def _chunks(scene: Scene) -> Iterator[bytes]:
         yield bytes(layout.aligned(len(payload)) - len(payload))
 
 
-def _payloads(scene: Scene) -> dict[bytes, bytes]:
+def _payloads(scene: Scene) -> dict[bytes, bytes | memoryview]:
     return {
         layout.SCENE.kind: _scene_record(scene),
-        layout.POSITIONS.kind: scene.positions.astype("<f4", copy=False).tobytes(),
-        layout.STRIP_VERTICES.kind: scene.vertices.astype("<u4").tobytes(),
+        layout.POSITIONS.kind: _view(scene.positions, "<f4"),
+        layout.STRIP_VERTICES.kind: _view(scene.vertices, "<i4"),
         layout.TURNS.kind: np.packbits(scene.turns, bitorder="little").tobytes(),
-        layout.STRIP_STARTS.kind: scene.starts.astype("<u4").tobytes(),
+        layout.STRIP_STARTS.kind: _view(scene.starts, "<i4"),
         layout.HIERARCHY.kind: scene.hierarchy.boxes.astype("<f4", copy=False).tobytes()
         + scene.hierarchy.left_count.astype("<u4", copy=False).tobytes(),
         layout.REMAP.kind: _remap_words(scene),
     }
+
+
+def _view(array: np.ndarray, kind: str) -> memoryview:
+    """The bytes of an array without a copy; no number in it is negative, so the sign bit is one more bit."""
+    return np.ascontiguousarray(array, kind).reshape(-1).view(np.uint8).data
 
 
 def _scene_record(scene: Scene) -> bytes:
@@ -125,14 +130,16 @@ def _scene_record(scene: Scene) -> bytes:
     return record.tobytes()
 
 
-def _remap_words(scene: Scene) -> bytes:
+def _remap_words(scene: Scene) -> bytes | memoryview:
     if scene.remap is None:
         return b""
-    rotation = scene.remap.rotation.astype("<u4") << layout.ROTATION_SHIFT
-    return (scene.remap.face.astype("<u4") | rotation).tobytes()
+    words = scene.remap.rotation.astype("<u4")
+    words <<= layout.ROTATION_SHIFT
+    words |= scene.remap.face.view("<u4")
+    return _view(words, "<u4")
 
 
-def _head(payloads: dict[bytes, bytes]) -> bytes:
+def _head(payloads: dict[bytes, bytes | memoryview]) -> bytes:
     table = np.zeros(len(payloads), layout.ENTRY.dtype)
     must_understand = {section.kind: section.must_understand for section in layout.SECTIONS}
     offset = _table_end(len(payloads))

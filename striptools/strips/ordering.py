@@ -33,11 +33,12 @@ working memory.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from striptools.errors import UsageError
+from striptools.partition.sah import LARGEST_BLOCK, SMALLEST_BLOCK
 from striptools.types import Counts, FaceIds, Faces
 
 if TYPE_CHECKING:
@@ -47,22 +48,44 @@ if TYPE_CHECKING:
 
 LARGEST_LENGTH = 2**30
 
+Method = Literal["strip-rt", "paper", "stripe", "tipsify"]
+EffortName = Literal["fast", "normal", "best"]
+METHODS: tuple[str, ...] = get_args(Method)
+EFFORT_NAMES: tuple[str, ...] = get_args(EffortName)
+
 
 @dataclass(frozen=True)
 class OrderingOptions:
-    """How sequences are joined.
+    """How faces are ordered into strips.
 
     Attributes:
         max_length: The most triangles in a sequence, 1 to 2**30.
-        distance_weight: Weight of nearness in the tree, 0 or more.
-        balance_weight: Weight of equal lengths, 0 or more.
+        method: `strip-rt` (strips/stripify.py), `paper` (Strip-RT as printed, this module), or one of the
+            baselines `stripe` and `tipsify`.
+        effort: How long `strip-rt` searches: `fast`, `normal` or `best` (strips/tunnelling.py).
+        distance_weight: Weight of nearness in the tree, 0 or more; looked at by `paper`.
+        balance_weight: Weight of equal lengths, 0 or more; looked at by `paper`.
+        block: Cut the mesh into blocks of at most so many triangles and as many vertices first, 4 to
+            65536, and order inside them; looked at by `strip-rt`. None for no blocks.
     """
 
-    max_length: int = 64
+    max_length: int = 128
+    method: Method = "strip-rt"
+    effort: EffortName = "normal"
     distance_weight: float = 0.5
     balance_weight: float = 0.5
+    block: int | None = None
 
     def __post_init__(self) -> None:
+        for name, value, allowed in (("method", self.method, METHODS), ("effort", self.effort, EFFORT_NAMES)):
+            if value not in allowed:
+                raise UsageError(f"{value!r} is not known", where=name, remedy=f"give {', '.join(allowed)}")
+        if self.block is not None and not SMALLEST_BLOCK <= self.block <= LARGEST_BLOCK:
+            raise UsageError(
+                f"{self.block} is out of range",
+                where="block",
+                remedy=f"give {SMALLEST_BLOCK} to {LARGEST_BLOCK}",
+            )
         if not 1 <= self.max_length <= LARGEST_LENGTH:
             raise UsageError(
                 f"{self.max_length} is out of range", where="max_length", remedy=f"give 1 to {LARGEST_LENGTH}"

@@ -24,8 +24,10 @@ Source: Lauterbach et al., ReduceM (EGSR 2008), step "Strip output", which print
 3. Where two faces share more than one edge, any crossing that leaves no face by its entry edge is found.
 
 **Classic strips** (classic_strips): triangle k of a strip is indices k, k + 1, k + 2, with the first two
-swapped for odd k. Equal turns in a row cost one repeated vertex each; strips are set apart by a restart
-index.
+swapped for odd k. Equal turns in a row cost one repeated vertex each. Strips are set apart by a restart index
+or by two repeated vertices; where a strip begins with the vertex that ended the one before, it follows at
+once, which saves the restart. Which strip follows, and from which end each is written, is free and chosen
+greedily.
 
 Cost: O(n), all of it.
 """
@@ -35,8 +37,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from striptools.errors import UsageError
+from striptools.kernels import classic_strips as classic
 from striptools.kernels import strip_topology as kernels
 from striptools.strips.ordering import Sequences
+from striptools.threads import SMALLEST_CHUNK, in_chunks
 from striptools.types import Bools, Counts, FaceIds, Faces, Rotations
 
 RESTART = -1
@@ -65,12 +69,13 @@ class Strips:
     rotation: Rotations
 
 
-def encode_strips(faces: Faces, sequences: Sequences) -> Strips:
+def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strips:
     """Write sequences of faces as generalised strips.
 
     Args:
         faces: (n, 3) int32.
         sequences: Each face once, neighbours share an edge run in opposite directions.
+        threads: How many threads share the strips; the result is the same for any number.
 
     Returns:
         Strips whose decoded triangles are the faces of `sequences.faces`, turned left by `rotation`.
@@ -79,49 +84,43 @@ def encode_strips(faces: Faces, sequences: Sequences) -> Strips:
         UsageError: A face in a sequence cannot be reached from the face before it.
     """
     order, starts = sequences.faces, sequences.starts
-    entries = _entries(faces, sequences)
     vertices = np.zeros(len(order) + 2 * (len(starts) - 1), np.int32)
     turns = np.zeros(len(order), np.bool_)
     rotation = np.zeros(len(order), np.uint8)
-    kernels.encode(faces, order, starts, entries, vertices, turns, rotation)
+    broken = in_chunks(
+        lambda part: kernels.encode(faces, order, starts, *part, vertices, turns, rotation),
+        len(starts) - 1,
+        threads,
+        _strips_a_chunk(starts),
+    )
+    _refuse_break(next((place for place in broken if place >= 0), -1), "encode_strips")
     return Strips(vertices, turns, starts, order, rotation)
 
 
-def decode_strips(vertices: Counts, turns: Bools, starts: Counts) -> Faces:
+def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int = 1) -> Faces:
     """The triangles of generalised strips, (n, 3) int32, in file order and with the winding of their sources.
 
     Args:
         vertices: (n + 2 s,) int32.
         turns: (n,) bool; those of first triangles are not looked at.
         starts: (s+1,) int32, from 0 to n, rising.
+        threads: How many threads share the strips.
 
     Raises:
         UsageError: Arrays whose lengths do not belong together.
     """
-    a, b, c = corner_places(turns, starts)
-    if len(vertices) != len(c) + 2 * (len(starts) - 1):
-        raise UsageError(f"{len(vertices)} vertices for {len(c)} triangles", where="decode_strips")
-    return np.stack([vertices[a], vertices[b], vertices[c]], axis=1)
-
-
-def corner_places(turns: Bools, starts: Counts) -> tuple[Counts, Counts, Counts]:
-    """Where in the strip vertices the three corners of each triangle stand: three arrays (n,) int32.
-
-    Raises:
-        UsageError: starts that do not rise from 0 to the number of turns.
-    """
-    count = len(turns)
-    if len(starts) == 0 or starts[0] != 0 or starts[-1] != count or (np.diff(starts) < 1).any():
-        raise UsageError(f"strip starts do not rise from 0 to {count}", where="starts")
-    last = np.arange(2, count + 2, dtype=np.int32)
-    last += 2 * np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
-    # The vertex before the newest is corner 0 after bit 0 and corner 1 after bit 1; the other one stays what
-    # it was.
-    a = np.where(turns, 0, last - 1)
-    b = np.where(turns, last - 1, 0)
-    a[starts[:-1]] = last[starts[:-1]] - 2
-    b[starts[:-1]] = last[starts[:-1]] - 1
-    return np.maximum.accumulate(a), np.maximum.accumulate(b), last
+    count, strip_count = len(turns), len(starts) - 1
+    _check_starts(starts, count, "starts")
+    if len(vertices) != count + 2 * strip_count:
+        raise UsageError(f"{len(vertices)} vertices for {count} triangles", where="decode_strips")
+    faces = np.zeros((count, 3), np.int32)
+    in_chunks(
+        lambda part: kernels.decode(vertices, turns, starts, *part, faces),
+        strip_count,
+        threads,
+        _strips_a_chunk(starts),
+    )
+    return faces
 
 
 def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: int) -> tuple[int, int, int]:
@@ -145,15 +144,35 @@ def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: in
     return int(vertices[places[0]]), int(vertices[places[1]]), int(vertices[last])
 
 
-def classic_strips(strips: Strips, restart: int = RESTART) -> Counts:
-    """Classic alternating strips as one index list, the strips set apart by `restart`.
+@dataclass(frozen=True)
+class ClassicCount:
+    """What classic strips take.
 
-    Every triangle keeps its winding. Two equal turns in a row cost one repeated vertex, which makes a
-    triangle of no area that decode_classic and every renderer drop.
+    Attributes:
+        indices: Length of the index list, all told.
+        restarts: Restart indices in it; 0 where strips are stitched.
+        joins: Places where a strip follows at once, for it begins with the vertex that ended the one before.
+        repeats: Vertices repeated for turns.
+    """
+
+    indices: int
+    restarts: int
+    joins: int
+    repeats: int
+
+
+def classic_strips(strips: Strips, restart: int | None = RESTART) -> Counts:
+    """Classic alternating strips as one index list.
+
+    Every triangle keeps its winding. Each strip is written from the end whose first turn fits its place, and
+    strips are put in an order in which many begin with the vertex that ended the one before: these follow at
+    once, and their common vertex stands twice. Other strips are set apart by `restart`, or by the last vertex
+    and the next one once more. Repeated vertices make triangles of no area that decode_classic and every
+    renderer drop.
 
     Args:
         strips: Generalised strips of faces with three different vertices.
-        restart: The index between strips; no vertex may have it.
+        restart: The index between strips, which no vertex may have; None to stitch them by repeated vertices.
 
     Returns:
         (k,) int32.
@@ -161,29 +180,48 @@ def classic_strips(strips: Strips, restart: int = RESTART) -> Counts:
     Raises:
         UsageError: A vertex has the restart index, or a triangle a repeated vertex.
     """
-    rows = decode_strips(strips.vertices, strips.turns, strips.starts)
-    if (strips.vertices == restart).any():
+    faces = _distinct_corners(strips)
+    if restart is not None and (strips.vertices == restart).any():
         raise UsageError(f"vertex {restart} is the restart index", where="restart")
-    if _repeats(rows).any():
+    plan, length, _ = _plan_classic(strips, faces, stitched=restart is None)
+    indices = np.zeros(length, np.int32)
+    written = classic.write(
+        faces, strips.turns, strips.starts, plan, -1 if restart is None else restart, restart is None, indices
+    )
+    assert written == length
+    return indices
+
+
+def count_classic(strips: Strips, restart: int | None = RESTART) -> ClassicCount:
+    """What `classic_strips` takes, without writing it down.
+
+    Args:
+        strips: Generalised strips of faces with three different vertices.
+        restart: An index for restarts, None for stitches.
+
+    Raises:
+        UsageError: A triangle has a repeated vertex.
+    """
+    _, length, joins = _plan_classic(strips, _distinct_corners(strips), stitched=restart is None)
+    apart = max(len(strips.starts) - 2, 0) - joins
+    between = apart if restart is not None else 2 * apart
+    repeats = length - len(strips.vertices) - between
+    return ClassicCount(length, apart if restart is not None else 0, joins, repeats)
+
+
+def _distinct_corners(strips: Strips) -> Faces:
+    faces = decode_strips(strips.vertices, strips.turns, strips.starts)
+    if _repeats(faces).any():
         raise UsageError(
             "a triangle has a repeated vertex", where="classic_strips", remedy="clean the mesh first"
         )
-    if len(rows) == 0:
-        return np.zeros(0, np.int32)
-    firsts = strips.starts[:-1]
-    lasts = strips.starts[1:] - 1
-    # A first triangle left by c -> a is turned once more, so that every strip starts with a turn of bit 0.
-    leaving = np.roll(strips.turns, -1)
-    leaving[lasts] = False
-    rows[firsts] = np.where(leaving[firsts, None], np.roll(rows[firsts], -1, axis=1), rows[firsts])
-    leaving[firsts] = False
-    # A swap repeats corner 0 or 1 before the newest vertex wherever a triangle is left by the turn it was
-    # entered by.
-    entered = np.roll(leaving, 1)
-    swaps = leaving == entered
-    swaps[firsts] = False
-    swaps[lasts] = False
-    return _written(rows, np.where(leaving, rows[:, 0], rows[:, 1]), swaps, firsts, restart)
+    return faces
+
+
+def _plan_classic(strips: Strips, faces: Faces, *, stitched: bool) -> tuple[classic.Plan, int, int]:
+    ends = classic.describe(faces, strips.turns, strips.starts)
+    vertex_count = int(strips.vertices.max(initial=-1)) + 1
+    return classic.plan(faces, strips.starts, ends, vertex_count, 2 if stitched else 1, stitched)
 
 
 def decode_classic(indices: Counts, restart: int = RESTART) -> Faces:
@@ -214,8 +252,7 @@ def check_sequences(sequences: Sequences, faces: Faces, max_length: int | None =
     _check_starts(starts, len(order), "sequences")
     longest = int(sequences.lengths.max(initial=0))
     _expect(max_length is None or longest <= max_length, "sequences", f"one has {longest} faces")
-    place = kernels.choose_entries(faces, order, starts, np.zeros(len(order), np.uint8))
-    _expect(place < 0, "sequences", f"the face at {place} does not continue the one before it")
+    _refuse_break(kernels.first_break(faces, order, starts), "sequences")
 
 
 def check_strips(strips: Strips, faces: Faces) -> None:
@@ -237,30 +274,17 @@ def check_strips(strips: Strips, faces: Faces) -> None:
     _expect(not wrong.any(), "strips", f"triangle {wrong.argmax()} is not its source face")
 
 
-def _entries(faces: Faces, sequences: Sequences) -> Rotations:
-    entries = np.zeros(len(sequences.faces), np.uint8)
-    place = kernels.choose_entries(faces, sequences.faces, sequences.starts, entries)
-    if place >= 0:
-        raise UsageError(f"the face at {place} does not continue the one before it", where="encode_strips")
-    return entries
+def _refuse_break(place: int, where: str) -> None:
+    _expect(place < 0, where, f"the face at {place} does not continue the one before it")
+
+
+def _strips_a_chunk(starts: Counts) -> int:
+    """The fewest strips that are worth a thread, by what they hold on average."""
+    return max(1, SMALLEST_CHUNK * (len(starts) - 1) // max(1, int(starts[-1])))
 
 
 def _repeats(rows: Faces) -> Bools:
     return (rows[:, 0] == rows[:, 1]) | (rows[:, 1] == rows[:, 2]) | (rows[:, 2] == rows[:, 0])
-
-
-def _written(rows: Faces, pivots: Counts, swaps: Bools, firsts: Counts, restart: int) -> Counts:
-    """Lay out: before each first triangle a restart and its first two corners, before each swap its pivot."""
-    ahead = swaps.astype(np.int64)
-    ahead[firsts] = 3
-    at = np.cumsum(ahead + 1) - 1
-    out = np.zeros(int(at[-1]) + 1, np.int32)
-    out[at] = rows[:, 2]
-    out[at[swaps] - 1] = pivots[swaps]
-    out[at[firsts] - 1] = rows[firsts, 1]
-    out[at[firsts] - 2] = rows[firsts, 0]
-    out[at[firsts] - 3] = restart
-    return out[1:]
 
 
 def _check_starts(starts: Counts, count: int, where: str) -> None:

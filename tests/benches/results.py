@@ -13,7 +13,9 @@ COLUMNS = (
     "date", "machine", "versions", "bench", "mesh", "triangles", "metric", "value", "unit",
     "peer", "peer_value", "ratio", "note",
 )  # fmt: skip
-PACKAGES = ("striptools", "numpy", "numba", "trimesh", "jax", "embreex")
+PACKAGES = (
+    "striptools", "numpy", "numba", "trimesh", "jax", "embreex", "meshoptimizer", "vtk", "PyFFI",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,162 @@
+"""`striptools study`: repeat a table of the literature on a model of one's own."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from striptools.errors import UsageError, WriteError
+from striptools.measure.plots import plot_study, require_plots
+from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range, study_strips
+from striptools.mesh.atomic import write_atomically
+from striptools.mesh.io import load_mesh
+from striptools.pipeline import Options
+from striptools.strips.ordering import OrderingOptions
+from striptools.trace.device import DeviceKind
+from striptools_cli import log, notice
+from striptools_cli.progress import StageProgress
+from striptools_cli.report import Format, render, render_table
+from striptools_cli.streams import STANDARD, Source, input_format, say
+
+Subject = Literal["strips"]
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+_DEFAULTS = StudyOptions()
+_ORDER = OrderingOptions()
+_QUICK = {"side": 128, "runs": 3}
+
+
+def run(
+    subject: Annotated[Subject, typer.Argument(help="What to compare.")],
+    mesh: Annotated[str, typer.Argument(metavar="MESH", help="The model; - for standard input.")],
+    out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", help="Write MODEL-strips.png (a plot) and .csv there.", show_default="no"
+        ),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs: a first impression.")] = False,
+    side: Annotated[
+        int | None,
+        typer.Option(
+            min=8, max=8192, metavar="N", help="N x N primary rays.", show_default=str(_DEFAULTS.side)
+        ),
+    ] = None,
+    runs: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Runs to take the median of.", show_default=str(_DEFAULTS.runs)
+        ),
+    ] = None,
+    max_length: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Most triangles in a strip of Strip-RT.")
+    ] = _ORDER.max_length,
+    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = "y",
+    device: Annotated[
+        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
+    ] = "auto",
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
+    ] = None,
+    from_format: Annotated[
+        str | None, typer.Option("--from", metavar="FORMAT", help="Format of MESH.", show_default="extension")
+    ] = None,
+    form: Annotated[Format, typer.Option("--format", help="How to print the tables.")] = "text",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and tables.")] = False,
+) -> None:
+    """Compare what stripifiers make of a mesh, all else being equal.
+
+    `study strips` repeats Table 3.2 of the Strip-RT paper: memory and traced rays a second of the same scene
+    with strips by Strip-RT, by a STRIPE-like greedy and by Tipsify, beside the paper's own ratios and the
+    strips' quality. Needs the extra trace, and with --out the extra plots.
+    """
+    log.set_up(quiet=quiet)
+    folder = None if out is None else _folder(out)
+    options = StudyOptions(
+        options=Options(ordering=OrderingOptions(max_length), threads=threads),
+        side=side or (_QUICK if quick else {}).get("side", _DEFAULTS.side),
+        runs=runs or (_QUICK if quick else {}).get("runs", _DEFAULTS.runs),
+        up=up,
+        device=device,
+        threads=threads,
+    )
+    file = Source.open(mesh)
+    source = load_mesh(file.file, file_format=input_format(file, from_format) or None)
+    notice.before_tracing(quiet=quiet)
+    with StageProgress(quiet=quiet) as progress:
+        study = study_strips(source, options, watch=progress.watch)
+    say(printed(study, form, file.title))
+    if folder is not None:
+        stem = "standard-input" if mesh == STANDARD else Path(file.title).stem
+        picture = folder / f"{stem}-{subject}.png"
+        plot_study(study, picture, file.title)
+        write_atomically(picture.with_suffix(".csv"), printed(study, "csv", "").encode())
+        if not quiet:
+            say(f"written: {picture} and {picture.with_suffix('.csv').name}\n", error=True)
+
+
+def printed(study: Study, form: Format, title: str) -> str:
+    """The study as text, json, csv or md: what tracing costs, then what the strips are."""
+    speed, strips = [_speed(study, row) for row in study.rows], [_strips(row) for row in study.rows]
+    if form == "json":
+        facts = dataclasses.asdict(study)
+        for part, row in zip(facts["rows"], study.rows, strict=True):
+            part["paper_ratio"] = paper_range(row.method)
+            part["quality"]["relative_cost"] = row.quality.relative_cost
+        return render(facts, "json")
+    if form == "csv":
+        rows = [{**one, **other} for one, other in zip(speed, strips, strict=True)]
+        return render_table(rows, "csv")
+    heading = f"{title}: {study.triangles:,} triangles, {study.primary_rays:,} primary and "
+    heading += f"{study.secondary_rays:,} secondary rays on {', '.join(study.devices)}"
+    heading += "; lead: rays a second of strip-rt over the row's"
+    return render_table(speed, form, heading) + "\n" + render_table(strips, form, "Strips")
+
+
+def _speed(study: Study, row: StudyRow) -> dict[str, object]:
+    band = paper_range(row.method)
+    return {
+        "variant": row.variant,
+        "MB": row.scene_bytes / 1e6,
+        "B/triangle": row.scene_bytes / study.triangles,
+        "with_swaps": row.swap_bytes / study.triangles,
+        "Mrays/s": row.primary_rate / 1e6,
+        "lead": row.primary_ratio,
+        "paper's_lead": f"{band[0]:.2f}-{band[1]:.2f}" if band else "",
+        "steps": row.primary_steps,
+        "secondary_Mrays/s": row.secondary_rate / 1e6,
+        "secondary_lead": row.secondary_ratio,
+        "secondary_steps": row.secondary_steps,
+    }
+
+
+def _strips(row: StudyRow) -> dict[str, object]:
+    quality = row.quality
+    return {
+        "variant": row.variant,
+        "strips": quality.strips,
+        "singletons": quality.singletons,
+        "longest": quality.longest,
+        "vertices/triangle": quality.vertices_per_triangle,
+        "classic_indices/triangle": quality.classic_indices,
+        "without_restarts": quality.classic_indices_without_restarts,
+        "swaps": quality.swaps,
+        "strip_area": quality.strip_area,
+        "half_share": quality.half_share,
+        "relative_cost": quality.relative_cost,
+        "order_s": row.order_seconds,
+    }
+
+
+def _folder(name: str) -> Path:
+    """The folder to write to, made where it is missing; before any work, so that none is lost."""
+    require_plots()
+    path = Path(name)
+    if path.exists() and not path.is_dir():
+        raise UsageError("is no folder", where=name, remedy="name a folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WriteError(error.strerror or "cannot be made", where=name) from error
+    return path

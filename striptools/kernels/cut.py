@@ -1,0 +1,46 @@
+"""Cut an object tree into ranges of leaves: the loop behind partition/cut.py."""
+
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def meets_few(faces, order, begin, end, seen, stamp, most):
+    """Whether the faces order[begin:end] have at most `most` different vertices; marks them with `stamp`."""
+    count = 0
+    for position in range(begin, end):
+        for corner in range(3):
+            vertex = faces[order[position], corner]
+            if seen[vertex] != stamp:
+                seen[vertex] = stamp
+                count += 1
+        if count > most:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
+    """Write the first positions of the largest subtrees within both limits; returns how many there are.
+
+    A single item always passes. `seen` has an entry a vertex, none of them a node's number; without entries
+    only items count.
+    """
+    count = 0
+    node = 0
+    begin = 0
+    while begin < order.shape[0]:
+        items = size[node]
+        fits = items == 1
+        if not fits and items <= most_items:
+            fits = seen.shape[0] == 0 or meets_few(
+                faces, order, begin, begin + items, seen, node, most_vertices
+            )  # fmt: skip
+        # Take the whole subtree and step behind it, or look at its left child.
+        if fits:
+            starts[count] = begin
+            count += 1
+            begin += items
+            node += 2 * items - 1
+        else:
+            node += 1
+    return count

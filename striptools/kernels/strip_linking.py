@@ -1,0 +1,101 @@
+"""One greedy pass over the dual edges: the loops behind strips/linking.py.
+
+Faces of a range are numbered by their place in it. `mate` (3n,) int32 holds the half-edge linked to each
+half-edge, or -1; `links` (n,) uint8 the links of each face.
+"""
+
+import numpy as np
+from numba import njit
+
+CLASSES = 64
+"""Two classes an octave of subtree sizes: more than any int32 size needs."""
+
+
+@njit(cache=True, nogil=True)
+def size_class(count):
+    """Which of the classes a subtree of `count` >= 2 items falls in: two an octave."""
+    octave = 0
+    while count >> (octave + 1):
+        octave += 1
+    return 2 * octave + (count >> (octave - 1) & 1)
+
+
+@njit(cache=True, nogil=True)
+def common_size(a, b, parent, size):
+    """Items below the lowest node that holds both nodes."""
+    while not a <= b < a + 2 * size[a] - 1:
+        a = parent[a]
+    return size[a]
+
+
+@njit(cache=True, nogil=True)
+def link_range(ring, faces, leaf, parent, size, most, mate, links):
+    """Link the faces of a range into paths of at most `most` faces, the nearest in the tree first.
+
+    Args:
+        ring: (3n,) int32 rings of half-edges.
+        faces: (n, 3) int32.
+        leaf: (n,) int32, each face's leaf in the tree.
+        parent: The tree's.
+        size: The tree's.
+        most: The most faces of a path.
+        mate: (3n,) int32 to fill.
+        links: (n,) uint8 to fill.
+    """
+    count = faces.shape[0]
+    half_edges = 3 * count
+    mate[:] = -1
+    links[:] = 0
+    # Give every pair of half-edges that run an edge in opposite directions the class of its common node.
+    first = np.zeros(CLASSES + 1, np.int32)
+    pair_class = np.empty(half_edges + half_edges // 4 + 8, np.uint8)
+    pairs = 0
+    for h in range(half_edges):
+        g = ring[h]
+        while g != h:
+            if g > h and g // 3 != h // 3 and faces[h // 3, h % 3] != faces[g // 3, g % 3]:
+                c = size_class(common_size(leaf[h // 3], leaf[g // 3], parent, size))
+                pair_class[pairs] = c
+                first[c + 1] += 1
+                pairs += 1
+            g = ring[g]
+    for c in range(CLASSES):
+        first[c + 1] += first[c]
+    # Sort the pairs by class, those of one class as they were found.
+    leave = np.empty(pairs, np.int32)
+    enter = np.empty(pairs, np.int32)
+    pair = 0
+    for h in range(half_edges):
+        g = ring[h]
+        while g != h:
+            if g > h and g // 3 != h // 3 and faces[h // 3, h % 3] != faces[g // 3, g % 3]:
+                at = first[pair_class[pair]]
+                first[pair_class[pair]] += 1
+                leave[at] = h
+                enter[at] = g
+                pair += 1
+            g = ring[g]
+    # Link each pair whose half-edges and faces are free, unless that closes a path or makes it too long.
+    far = np.arange(count).astype(np.int32)
+    length = np.ones(count, np.int32)
+    for pair in range(pairs):
+        h = leave[pair]
+        g = enter[pair]
+        t = h // 3
+        u = g // 3
+        if links[t] > 1 or links[u] > 1 or mate[h] >= 0 or mate[g] >= 0:
+            continue
+        if far[t] == u or length[t] + length[u] > most:
+            continue
+        mate[h] = g
+        mate[g] = h
+        links[t] += 1
+        links[u] += 1
+        # Let the two ends of the joined path know each other and its length.
+        one = far[t]
+        other = far[u]
+        total = length[t] + length[u]
+        far[one] = other
+        far[other] = one
+        length[one] = total
+        length[other] = total
