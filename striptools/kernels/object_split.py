@@ -25,8 +25,9 @@ WEIGHT = 7
 Tree = namedtuple("Tree", "order leaf_node parent size")
 """The tree as it grows: arrays of (n,), (n,), (2n-1,) and (2n-1,) int32."""
 
-Bins = namedtuple("Bins", "boxes weight right_cost")
-"""boxes (3 b, 6) float32 and weight (3 b,) int64 for b bins, axis after axis; right_cost (b,) float64."""
+Bins = namedtuple("Bins", "boxes weight right_cost full")
+"""boxes (3 b, 6) float32 and weight (3 b,) int64 for b bins, axis after axis; right_cost (b,) float64 and
+full (b,) int64 are room for one axis."""
 
 Short = namedtuple("Short", "boxes weight centre rank before right_cost goes_left stack")
 """A short range while it is split: its rows in float64, by their first places; rank (4, k), the places by
@@ -180,30 +181,32 @@ def best_bin(bounds, bins):
     for axis in range(3):
         if not bounds[0, 3 + axis] > bounds[0, axis]:
             continue
-        # Gather the cost of everything to the right of each boundary; none without items there.
+        # List the bins that hold items: a boundary behind an empty one costs what the one before it costs.
+        row = axis * count
+        full = 0
+        for slot in range(count):
+            bins.full[full] = slot
+            full += 1 if bins.weight[row + slot] > 0 else 0
+        # Gather the cost of everything to the right of each boundary.
         box = EMPTY_BOX
         weight = 0
-        cost = np.inf
-        for slot in range(count - 1, 0, -1):
-            row = axis * count + slot
-            if bins.weight[row] > 0:
-                box = join(box, bins.boxes, row)
-                weight += bins.weight[row]
-                cost = area(box) * weight
-            bins.right_cost[slot] = cost
-        # Sweep from the left and keep the first of the cheapest boundaries, which follows a bin with items.
+        for k in range(full - 1, 0, -1):
+            slot = bins.full[k]
+            box = join(box, bins.boxes, row + slot)
+            weight += bins.weight[row + slot]
+            bins.right_cost[k] = area(box) * weight
+        # Sweep from the left and keep the first of the cheapest boundaries.
         box = EMPTY_BOX
         weight = 0
-        for slot in range(count - 1):
-            row = axis * count + slot
-            if bins.weight[row] > 0:
-                box = join(box, bins.boxes, row)
-                weight += bins.weight[row]
-                cost = area(box) * weight + bins.right_cost[slot + 1]
-                if cost < best:
-                    best = cost
-                    best_axis = axis
-                    best_slot = slot
+        for k in range(full - 1):
+            slot = bins.full[k]
+            box = join(box, bins.boxes, row + slot)
+            weight += bins.weight[row + slot]
+            cost = area(box) * weight + bins.right_cost[k + 1]
+            if cost < best:
+                best = cost
+                best_axis = axis
+                best_slot = slot
     return best_axis, best_slot
 
 
@@ -517,6 +520,7 @@ def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sa
         np.empty((3 * bin_count, 6), np.float32),
         np.empty(3 * bin_count, np.int64),
         np.empty(bin_count, np.float64),
+        np.empty(bin_count, np.int64),
     )
     short = room_for_short(max(2, sweep_below))
     spare = np.empty((end - begin + 1, 4), np.uint64)

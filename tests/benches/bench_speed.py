@@ -42,7 +42,7 @@ print(time.perf_counter() - begin)
 
 def main() -> int:
     """Measure what is asked for and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description="Seconds by stage and the peak of memory.")
     parser.add_argument("meshes", nargs="*", type=Path)
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--runs", type=int, default=3)
