@@ -14,6 +14,7 @@ ROW = 24
 
 ONE = np.float32(1)
 ZERO = np.float32(0)
+LARGEST = np.float32(np.finfo(np.float32).max)
 LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 FAR_FACTOR = np.float32(1 + 2**-21)
 MARGIN = np.float32(2**-21)
@@ -41,11 +42,21 @@ def larger(a, b):
 
 
 @njit(cache=True, nogil=True)
-def lanes_met(root, low, high, inverse, limit, mirror):
+def picked(x, y, z, axis):
+    """The coordinate along an axis."""
+    return x if axis == 0 else (y if axis == 1 else z)
+
+
+@njit(cache=True, nogil=True)
+def steep(way):
+    """A direction component, or a tiny one of the same sign for one too small to cross the scene."""
+    tiny = -TINY if way < ZERO else TINY
+    return tiny if abs(way) < TINY else way
+
+
+@njit(cache=True, nogil=True)
+def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
     """The root's lanes that a ray meets, as bits in the order of visits, the nearest highest."""
-    lx, ly, lz = low[0], low[1], low[2]
-    hx, hy, hz = high[0], high[1], high[2]
-    ix, iy, iz = inverse[0], inverse[1], inverse[2]
     lanes = np.int32(0)
     for lane in range(WIDTH):
         ax = root[0, lane] * ix - lx
@@ -87,52 +98,50 @@ def ready_rays(
     """
     room = len(rays)
     count = 0
-    o = np.zeros(3, np.float32)
-    d = np.zeros(3, np.float32)
-    low = np.zeros(3, np.float32)
-    high = np.zeros(3, np.float32)
-    inverse = np.zeros(3, np.float32)
     for r in range(begin, len(origins)):
         if count == room:
             return count, r
 
         # Scale the ray by powers of two; refuse what is no ray.
-        for k in range(3):
-            o[k] = flushed(flushed(origins[r, k]) * scale)
-            d[k] = flushed(directions[r, k])
-        size_x, size_y, size_z = abs(d[0]), abs(d[1]), abs(d[2])
-        longest = larger(larger(size_x, size_y), size_z)
+        ox = flushed(flushed(origins[r, 0]) * scale)
+        oy = flushed(flushed(origins[r, 1]) * scale)
+        oz = flushed(flushed(origins[r, 2]) * scale)
+        dx = flushed(directions[r, 0])
+        dy = flushed(directions[r, 1])
+        dz = flushed(directions[r, 2])
+        largest = larger(larger(abs(ox), abs(oy)), abs(oz))
+        longest = larger(larger(abs(dx), abs(dy)), abs(dz))
         far = flushed(t_max[r])
-        finite = np.isfinite(o[0]) and np.isfinite(o[1]) and np.isfinite(o[2])
-        finite = finite and np.isfinite(d[0]) and np.isfinite(d[1]) and np.isfinite(d[2])
-        if not (finite and longest >= LEAST_NORMAL and far > ZERO):
+        finite = (abs(ox) <= LARGEST) & (abs(oy) <= LARGEST) & (abs(oz) <= LARGEST)
+        finite &= (abs(dx) <= LARGEST) & (abs(dy) <= LARGEST) & (abs(dz) <= LARGEST)
+        if not (finite & (longest >= LEAST_NORMAL) & (far > ZERO)):
             dropped[r] = 2
             continue
         exponent = min(max(np.float32(longest).view(np.int32) >> 23, 1), 253)
         shorten = np.int32((254 - exponent) << 23).view(np.float32)
         length = np.int32(exponent << 23).view(np.float32)
-        for k in range(3):
-            d[k] = flushed(d[k] * shorten)
+        dx = flushed(dx * shorten)
+        dy = flushed(dy * shorten)
+        dz = flushed(dz * shorten)
         far = flushed(flushed(far * length) * scale)
 
         # Make the constants of the slab test.
-        margin = MARGIN * larger(larger(abs(o[0]), abs(o[1])), larger(abs(o[2]), reach))
+        margin = MARGIN * larger(largest, reach)
         mirror = np.int32(7)
-        for k in range(3):
-            way = d[k]
-            if abs(way) < TINY:
-                way = -TINY if d[k] < ZERO else TINY
-            if d[k] < ZERO:
-                mirror ^= np.int32(1 << k)
-            inverse[k] = ONE / way
-            low[k] = flushed(flushed(o[k] + margin) * inverse[k])
-            high[k] = flushed(flushed(o[k] - margin) * inverse[k])
+        mirror ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
+        ix, iy, iz = ONE / steep(dx), ONE / steep(dy), ONE / steep(dz)
+        lx = flushed(flushed(ox + margin) * ix)
+        ly = flushed(flushed(oy + margin) * iy)
+        lz = flushed(flushed(oz + margin) * iz)
+        hx = flushed(flushed(ox - margin) * ix)
+        hy = flushed(flushed(oy - margin) * iy)
+        hz = flushed(flushed(oz - margin) * iz)
 
         # Visit the root: a ray that meets none of its children is done.
         child = np.int32(0)
         lanes = np.int32(0)
         if visit:
-            lanes = lanes_met(root, low, high, inverse, far * SLACK, mirror)
+            lanes = lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, far * SLACK, mirror)
             if lanes == 0:
                 dropped[r] = 1
                 continue
@@ -142,20 +151,25 @@ def ready_rays(
         dropped[r] = 0
 
         # Write the row: slab, shear, distances, then axes, mirror and the place to start from.
-        size_x, size_y, size_z = abs(d[0]), abs(d[1]), abs(d[2])
-        z = 0 if size_x >= size_y and size_x >= size_z else (1 if size_y >= size_z else 2)
+        z = 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
-        for k in range(3):
-            rays[count, k] = low[k]
-            rays[count, 3 + k] = high[k]
-            rays[count, 6 + k] = inverse[k]
-        rays[count, 9] = o[x]
-        rays[count, 10] = o[y]
-        rays[count, 11] = o[z]
-        rays[count, 12] = flushed(d[x] / d[z])
-        rays[count, 13] = flushed(d[y] / d[z])
-        rays[count, 14] = ONE / d[z]
+        depth = picked(dx, dy, dz, z)
+        rays[count, 0] = lx
+        rays[count, 1] = ly
+        rays[count, 2] = lz
+        rays[count, 3] = hx
+        rays[count, 4] = hy
+        rays[count, 5] = hz
+        rays[count, 6] = ix
+        rays[count, 7] = iy
+        rays[count, 8] = iz
+        rays[count, 9] = picked(ox, oy, oz, x)
+        rays[count, 10] = picked(ox, oy, oz, y)
+        rays[count, 11] = picked(ox, oy, oz, z)
+        rays[count, 12] = flushed(picked(dx, dy, dz, x) / depth)
+        rays[count, 13] = flushed(picked(dx, dy, dz, y) / depth)
+        rays[count, 14] = ONE / depth
         rays[count, 15] = far
         rays[count, 16] = flushed(shorten / scale)
         words[count, 17] = x

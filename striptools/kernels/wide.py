@@ -325,7 +325,7 @@ def weigh_hits(
             way[axis] = flushed(directions[r, axis])
             start[axis] = flushed(flushed(origins[r, axis]) * scale)
 
-        # Shear the corners so that the ray runs along its dominant axis.
+        # Shear the corners, which hold no denormals, so that the ray runs along its dominant axis.
         size_x = abs(way[0])
         size_y = abs(way[1])
         size_z = abs(way[2])
@@ -335,9 +335,9 @@ def weigh_hits(
         slope_x = flushed(way[kx] / way[kz])
         slope_y = flushed(way[ky] / way[kz])
         for j in range(3):
-            z = flushed(flushed(blocks[leaf, 3 * kz + j, lane]) - start[kz])
-            near_x = flushed(flushed(blocks[leaf, 3 * kx + j, lane]) - start[kx])
-            near_y = flushed(flushed(blocks[leaf, 3 * ky + j, lane]) - start[ky])
+            z = flushed(blocks[leaf, 3 * kz + j, lane] - start[kz])
+            near_x = flushed(blocks[leaf, 3 * kx + j, lane] - start[kx])
+            near_y = flushed(blocks[leaf, 3 * ky + j, lane] - start[ky])
             x[j] = flushed(near_x - flushed(slope_x * z))
             y[j] = flushed(near_y - flushed(slope_y * z))
 

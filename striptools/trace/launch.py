@@ -21,8 +21,11 @@ nothing."""
 GPU_TILES = (2**12, 2**16, 2**20)
 
 IN_FLIGHT = 4
-"""Tiles that devices work on or wait for while results are taken: bounds memory, whatever the number of
+"""Tiles that a GPU works on or waits for while results are taken: bounds memory, whatever the number of
 rays."""
+
+READY_IN_FLIGHT = 2
+"""The same of CPU devices: more only push each other's rays out of the cache."""
 
 _RAYS = PartitionSpec("device")
 _EVERYWHERE = PartitionSpec()
@@ -106,16 +109,18 @@ def stream_ready(
         spare.append(buffers)
         return buffers[1][:live], results
 
+    root = _root(host)
     begin = 0
     while begin < count:
         buffers = spare.pop() if spare else _ready_buffers(room * mesh.size)
-        live, begin = ready_rays(*rays, begin, *_root(host), True, buffers[0], *_views(buffers), dropped)
+        places = (buffers[0], buffers[0].view(np.int32), buffers[1])
+        live, begin = ready_rays(*rays, begin, *root, True, *places, dropped)
         if live:
             _, per_device = next(tiles(live, mesh.size, TILES))
             with quiet_jax():
                 padded = _spread(buffers[0][:live], mesh.size, per_device)
                 waiting.append((live, per_device, compiled(scene, jax.device_put(padded, split)), buffers))
-        if len(waiting) >= IN_FLIGHT:
+        if len(waiting) >= READY_IN_FLIGHT:
             yield collect()
     while waiting:
         yield collect()
@@ -124,10 +129,6 @@ def stream_ready(
 def _ready_buffers(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Places for ready rays, and for which ones they are."""
     return aligned_full((count, ROW), 0.0), np.zeros(count, np.int32)
-
-
-def _views(buffers: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return buffers[0].view(np.int32), buffers[1]
 
 
 def _root(scene: WideScene) -> tuple[np.float32, np.float32, np.ndarray, np.ndarray]:

@@ -110,8 +110,9 @@ class Tracer:
                 counted[at] = traced[2]
             _check_ended(traced[1])
             # On this side, while the devices are at the next rays.
-            found = (at, *traced[:2], layout.place, blocks, scale, layout.triangle_of)
-            weigh_hits(*rays[:2], *found, t, face, u, v, triangle)
+            found_t, found_face = traced[:2]
+            found = (at, found_t, found_face, layout.place, blocks, scale, layout.triangle_of)
+            weigh_hits(rays[0], rays[1], *found, t, face, u, v, triangle)
         if steps:
             counted[dropped == 1] = 1
         return Hits(t, face, u, v, triangle, counted if steps else None)
