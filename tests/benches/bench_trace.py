@@ -5,7 +5,8 @@
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
 occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
-any hit; through the stored hierarchy of the scene, a rebuilt one, or both. The two tracers take turns; a ratio is the median of the ratios of runs next to each other in time.
+any hit; through the stored hierarchy of the scene, a rebuilt one, or both. The two tracers take turns; a
+ratio is the median of the ratios of runs next to each other in time.
 """
 
 import os
