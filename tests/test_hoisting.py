@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scenes import small_scene
 
+from striptools.kernels.rays import ROW
 from striptools.trace import Tracer
 from striptools.trace.launch import program
 from striptools.trace.walk_wide import WalkOptions
@@ -25,8 +26,8 @@ def loops_outside_hoisted_calls(text):
 def compiled_text(any_hit, steps=False):
     tracer = Tracer(small_scene(), device="cpu")
     options = tracer._options(any_hit=any_hit, steps=steps)
-    rays = np.zeros((256 * len(tracer.devices), 3), np.float32)
-    lowered = program(tracer._mesh, options).lower(tracer._scene, rays, rays, rays[:, 0])
+    rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
+    lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
     return lowered.compile().as_text()
 
 

@@ -11,11 +11,12 @@ from scenes import scene_of, scenes, small_scene
 from strategies import book, cube, fan, grid, soup, sphere, stack
 
 from striptools.errors import StriptoolsError, UsageError
+from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 from striptools.trace.launch import _collect, _spread, tiles
-from striptools.trace.leaves import lay_out, scale_of, size_class
-from striptools.trace.walk_wide import DONE, WalkOptions, trace_rays
+from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
+from striptools.trace.walk_wide import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
 
 LOWEST = np.finfo(np.float32).min
 
@@ -321,6 +322,65 @@ def test_walking_all_rays_at_once_gives_the_same(ball):
     np.testing.assert_array_equal(traced.t, expected.t)
     np.testing.assert_array_equal(traced.face, expected.face)
     assert np.asarray(traced.steps).min() >= 1
+
+
+def assert_rebuilt_gives_the_same(scene, origins, directions):
+    stored = Tracer(scene, device="cpu", threads=1)
+    rebuilt = Tracer(scene, device="cpu", threads=1, hierarchy="rebuilt")
+    first, other = stored.closest_hit(origins, directions), rebuilt.closest_hit(origins, directions)
+    doubted = far_fetched(scene, first, origins, directions) | far_fetched(scene, other, origins, directions)
+    for name in ("t", "face", "u", "v", "triangle"):
+        np.testing.assert_array_equal(getattr(first, name)[~doubted], getattr(other, name)[~doubted])
+    some = stored.any_hit(origins, directions) == rebuilt.any_hit(origins, directions)
+    assert (some | doubted).all()
+    return doubted
+
+
+@settings(max_examples=20)
+@given(scenes(), st.integers(0, 2**32 - 1))
+def test_a_rebuilt_hierarchy_changes_nothing(drawn, seed):
+    _, scene = drawn
+    origins, directions = aimed_rays(scene.positions, scene.faces(), 64, seed)
+    assert_rebuilt_gives_the_same(scene, origins, directions)
+
+
+@pytest.mark.parametrize("remap", [True, False])
+def test_a_rebuilt_hierarchy_changes_nothing_of_a_ball(remap):
+    scene = scene_of(Mesh(*sphere(4)), remap=remap)
+    origins, directions = aimed_rays(scene.positions, scene.faces(), 3000, 11)
+    assert not assert_rebuilt_gives_the_same(scene, origins, directions).any()
+
+
+def test_there_is_no_third_hierarchy(ball):
+    with pytest.raises(UsageError, match="no such hierarchy"):
+        Tracer(ball, device="cpu", threads=1, hierarchy="best")
+
+
+@pytest.mark.parametrize("unit", [2.0**-100, 1e-3, 1.0, 2.0**100])
+def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit):
+    scene = replace(ball, positions=(ball.positions * np.float32(unit)).astype(np.float32))
+    arrays = lay_out(scene).arrays
+    origins, directions = aimed_rays(scene.positions, scene.faces(), 2000, 12)
+    random = np.random.default_rng(13)
+    odd = np.array([0, -0.0, 1e-45, -1e-39, 1e-20, -1e-25, 1, -3, 1e30, 3e38, np.inf, -np.inf, np.nan], "f4")
+    origins[:400] = np.where(random.random((400, 3)) < 0.3, random.choice(odd, (400, 3)), origins[:400])
+    directions[:800] = np.where(random.random((800, 3)) < 0.3, random.choice(odd, (800, 3)), directions[:800])
+    reach = random.choice(np.array([np.inf, 1, 1e-40, 0, -1, np.nan, 1e38, 1e-30], "f4"), 2000)
+    device = np.asarray(jax.jit(prepared_rays)(arrays, origins, directions, reach))
+    rows, at = aligned_full((2000, ROW), 0.0), np.zeros(2000, np.int32)
+    dropped = np.zeros(2000, np.uint8)
+    root = (arrays.scale, arrays.reach, arrays.nodes[0], arrays.nodes[0, 6].view(np.int32))
+    count, end = ready_rays(
+        origins, directions, reach, 0, *root, False, rows, rows.view(np.int32), at, dropped
+    )
+    assert end == 2000
+    assert 1 <= count < 2000
+    none = device.view(np.int32)[:, FLOATS + 4] == 0
+    np.testing.assert_array_equal(none, dropped == 2)
+    np.testing.assert_array_equal(at[:count], np.flatnonzero(~none))
+    np.testing.assert_array_equal(rows[:count, :FLOATS], device[~none, :FLOATS])
+    words = rows.view(np.int32)[:count, FLOATS:]
+    np.testing.assert_array_equal(words, device.view(np.int32)[~none, FLOATS:])
 
 
 def test_power_of_two_units_change_nothing(ball):

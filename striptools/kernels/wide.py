@@ -279,17 +279,23 @@ def fill_leaf_blocks(
 
 
 @njit(cache=True, nogil=True)
-def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, v, triangle):
+def weigh_hits(
+    origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
+):
     """Where on its face each hit lies: the watertight test's own edge functions, once, for the face hit.
 
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32, not zero where there is a hit.
-        face: (r,) int32, the reported face; negative on a miss.
+        at: (k,) int32, the rays that results are for; others are left alone.
+        found_t: (k,) float32, t of each.
+        found_face: (k,) int32, the reported face; negative on a miss.
         place: (f,) int32, see `fill_leaf_blocks`.
         blocks: (l, 10, 8) float32, see `fill_leaf_blocks`.
         scale: float32, what positions in `blocks` were multiplied by.
         triangle_of: (f,) int32, the triangle in file order of each face.
+        t: (r,) float32, written.
+        face: (r,) int32, written.
         u: (r,) float32, written: the weight of the face's second corner.
         v: (r,) float32, written: the weight of its third corner.
         triangle: (r,) int32, written; -1 on a miss.
@@ -299,7 +305,10 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
     start = np.zeros(3, np.float32)
     x = np.zeros(3, np.float32)
     y = np.zeros(3, np.float32)
-    for r in range(len(face)):
+    for k in range(len(at)):
+        r = at[k]
+        t[r] = found_t[k]
+        face[r] = found_face[k]
         if face[r] < 0:
             u[r] = 0.0
             v[r] = 0.0
@@ -312,11 +321,11 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
         turn = slot & 3
 
         # Take the ray as the walk does, which reads denormals as zero.
-        for k in range(3):
-            way[k] = flushed(directions[r, k])
-            start[k] = flushed(flushed(origins[r, k]) * scale)
+        for axis in range(3):
+            way[axis] = flushed(directions[r, axis])
+            start[axis] = flushed(flushed(origins[r, axis]) * scale)
 
-        # Shear the corners so that the ray runs along its dominant axis.
+        # Shear the corners, which hold no denormals, so that the ray runs along its dominant axis.
         size_x = abs(way[0])
         size_y = abs(way[1])
         size_z = abs(way[2])
@@ -326,9 +335,9 @@ def weigh_hits(origins, directions, face, place, blocks, scale, triangle_of, u, 
         slope_x = flushed(way[kx] / way[kz])
         slope_y = flushed(way[ky] / way[kz])
         for j in range(3):
-            z = flushed(flushed(blocks[leaf, 3 * kz + j, lane]) - start[kz])
-            near_x = flushed(flushed(blocks[leaf, 3 * kx + j, lane]) - start[kx])
-            near_y = flushed(flushed(blocks[leaf, 3 * ky + j, lane]) - start[ky])
+            z = flushed(blocks[leaf, 3 * kz + j, lane] - start[kz])
+            near_x = flushed(blocks[leaf, 3 * kx + j, lane] - start[kx])
+            near_y = flushed(blocks[leaf, 3 * ky + j, lane] - start[ky])
             x[j] = flushed(near_x - flushed(slope_x * z))
             y[j] = flushed(near_y - flushed(slope_y * z))
 

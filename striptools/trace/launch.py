@@ -9,8 +9,10 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import quiet_jax
-from striptools.trace.walk_wide import WalkOptions, WideScene, trace_rays
+from striptools.trace.leaves import aligned_full
+from striptools.trace.walk_wide import WalkOptions, WideScene, trace_rays, walk_rays
 
 TILES = (2**8, 2**12, 2**16)
 """Rays a CPU device takes at once: few sizes, since each is compiled. A place not filled costs next to
@@ -19,8 +21,11 @@ nothing."""
 GPU_TILES = (2**12, 2**16, 2**20)
 
 IN_FLIGHT = 4
-"""Tiles that devices work on or wait for while results are taken: bounds memory, whatever the number of
+"""Tiles that a GPU works on or waits for while results are taken: bounds memory, whatever the number of
 rays."""
+
+READY_IN_FLIGHT = 2
+"""The same of CPU devices: more only push each other's rays out of the cache."""
 
 _RAYS = PartitionSpec("device")
 _EVERYWHERE = PartitionSpec()
@@ -39,28 +44,32 @@ def replicate(scene: WideScene, mesh: Mesh) -> WideScene:
 
 @lru_cache(maxsize=64)
 def program(mesh: Mesh, options: WalkOptions) -> Any:
-    """The jitted function (scene, origins, directions, t_max) -> Traced, its rays split over the devices."""
+    """The jitted function from a scene and rays to `Traced`, the rays split over the devices.
+
+    Rays are (origins, directions, t_max) where all are walked at once, else ready ones.
+    """
+    walk, arrays = (trace_rays, 3) if options.batch else (walk_rays, 1)
     split = jax.shard_map(
-        partial(trace_rays, options=options),
+        partial(walk, options=options),
         mesh=mesh,
-        in_specs=(_EVERYWHERE, _RAYS, _RAYS, _RAYS),
+        in_specs=(_EVERYWHERE, *(_RAYS,) * arrays),
         out_specs=_RAYS,
         check_vma=False,
     )
     return jax.jit(split)
 
 
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 def stream(
-    scene: WideScene,
-    rays: tuple[np.ndarray, np.ndarray, np.ndarray],
-    mesh: Mesh,
-    options: WalkOptions,
+    scene: WideScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-    """Trace any number of rays; yield the slice of them that is done and its results, in order."""
+    """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
     compiled = program(mesh, options)
     split = NamedSharding(mesh, _RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
-    for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES if options.batch else TILES):
+    for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
             waiting.append((part, per_device, compiled(scene, *jax.device_put(padded, split))))
@@ -68,6 +77,64 @@ def stream(
             yield _collect(*waiting.popleft(), mesh.size)
     while waiting:
         yield _collect(*waiting.popleft(), mesh.size)
+
+
+def stream_ready(
+    scene: WideScene, host: WideScene, rays: Rays, dropped: np.ndarray, mesh: Mesh, options: WalkOptions
+) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+    """Make rays ready on this side, trace those that meet a child of the root, and yield them in order.
+
+    Args:
+        scene: On the devices.
+        host: The same as NumPy arrays.
+        rays: Origins, directions and t_max.
+        dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
+        mesh: The CPU devices.
+        options: What to compile in.
+
+    Yields:
+        Which rays these are, int32, and their results.
+    """
+    compiled = program(mesh, options)
+    split = NamedSharding(mesh, _RAYS)
+    count = len(rays[0])
+    room = next((size for size in TILES if size * mesh.size >= count), TILES[-1])
+    spare: list[tuple[np.ndarray, np.ndarray]] = []
+    waiting: deque[tuple[int, int, Any, tuple[np.ndarray, np.ndarray]]] = deque()
+
+    def collect() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        live, per_device, traced, buffers = waiting.popleft()
+        results = _collect(slice(0, live), per_device, traced, mesh.size)[1]
+        # Results are there, so nobody reads these rays any more.
+        spare.append(buffers)
+        return buffers[1][:live], results
+
+    root = _root(host)
+    begin = 0
+    while begin < count:
+        buffers = spare.pop() if spare else _ready_buffers(room * mesh.size)
+        places = (buffers[0], buffers[0].view(np.int32), buffers[1])
+        live, begin = ready_rays(*rays, begin, *root, True, *places, dropped)
+        if live:
+            _, per_device = next(tiles(live, mesh.size, TILES))
+            with quiet_jax():
+                padded = _spread(buffers[0][:live], mesh.size, per_device)
+                waiting.append((live, per_device, compiled(scene, jax.device_put(padded, split)), buffers))
+        if len(waiting) >= READY_IN_FLIGHT:
+            yield collect()
+    while waiting:
+        yield collect()
+
+
+def _ready_buffers(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places for ready rays, and for which ones they are."""
+    return aligned_full((count, ROW), 0.0), np.zeros(count, np.int32)
+
+
+def _root(scene: WideScene) -> tuple[np.float32, np.float32, np.ndarray, np.ndarray]:
+    """Scale, reach, and the root's boxes and children."""
+    root = scene.nodes[0]
+    return scene.scale, scene.reach, root, root[6].view(np.int32)
 
 
 def tiles(count: int, devices: int, sizes: tuple[int, ...]) -> Iterator[tuple[slice, int]]:

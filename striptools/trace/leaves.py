@@ -9,8 +9,10 @@ from jaxtyping import Int32
 
 from striptools.hierarchies.in_strip import BinaryTree, expand_hierarchy
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
+from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.boxes import face_boxes
+from striptools.partition.object_split import split_objects
 from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
 
 if TYPE_CHECKING:
@@ -44,10 +46,26 @@ def lay_out(scene: "Scene") -> Layout:
     return lay_out_tree(scene, tree)
 
 
-def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
-    """Lay a scene out for the walk through any binary hierarchy over its triangles in file order."""
+def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
+    """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
+    boxes = face_boxes(scene.positions, scene.faces())
+    split = split_objects(boxes, threads=threads)
+    tree = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size)
+    return lay_out_tree(scene, tree, split.order)
+
+
+def lay_out_tree(scene: "Scene", tree: BinaryTree, order: Int32[np.ndarray, " n"] | None = None) -> Layout:
+    """Lay a scene out for the walk through any binary hierarchy over its triangles.
+
+    Args:
+        scene: Whose triangles they are.
+        tree: A leaf for each triangle.
+        order: (n,) int32, the triangle in file order of each leaf; None where they are in file order.
+    """
     faces = scene.faces()
     ids, rotations = _names(scene, len(faces))
+    triangle = np.arange(len(faces), dtype=np.int32) if order is None else order
+    faces, ids, rotations = faces[triangle], ids[triangle], rotations[triangle]
     wide = collapse(tree)
     scale = scale_of(scene)
     leaves = len(wide.leaf_first)
@@ -68,7 +86,7 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree) -> Layout:
         place,
     )
     triangle_of = np.full(face_count, -1, np.int32)
-    triangle_of[ids] = np.arange(len(ids), dtype=np.int32)
+    triangle_of[ids] = triangle
     nodes = _nodes(wide, scale)
     reach = np.float32(np.abs(scene.positions).max() * scale)
     return Layout(WideScene(nodes, blocks, scale, reach), place, triangle_of, wide.depth)

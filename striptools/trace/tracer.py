@@ -1,7 +1,8 @@
 """The tracer: rays in, closest hits or any hits out."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -10,12 +11,14 @@ from striptools.errors import StriptoolsError, UsageError
 from striptools.kernels.wide import weigh_hits
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.hit import Hits
-from striptools.trace.launch import device_mesh, replicate, stream
-from striptools.trace.leaves import Layout, lay_out
-from striptools.trace.walk_wide import STUCK, WalkOptions
+from striptools.trace.launch import Rays, device_mesh, replicate, stream, stream_ready
+from striptools.trace.leaves import Layout, lay_out, lay_out_rebuilt
+from striptools.trace.walk_wide import MISS, STUCK, WalkOptions
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
+
+HierarchyKind = Literal["stored", "rebuilt"]
 
 RAYS_SIDE_BY_SIDE = 2
 """Rays that a CPU walks at once; more gain nothing, since their constants no longer fit the registers."""
@@ -36,16 +39,33 @@ class Tracer:
         scene: What to trace.
         device: "auto" takes a GPU where JAX has one.
         threads: CPU devices to use, at most those JAX has; None for all.
+        hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
+            triangles first, which takes longer to build and is faster to walk. Hits are the same.
 
     Raises:
-        UsageError: There is no such device.
+        UsageError: There is no such device or hierarchy.
     """
 
-    def __init__(self, scene: "Scene", *, device: DeviceKind = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        scene: "Scene",
+        *,
+        device: DeviceKind = "auto",
+        threads: int | None = None,
+        hierarchy: HierarchyKind = "stored",
+    ) -> None:
+        if hierarchy not in ("stored", "rebuilt"):
+            raise UsageError(f"no such hierarchy: {hierarchy!r}", remedy="use stored or rebuilt")
         devices = trace_devices(device, threads)
         self._on_gpu = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
-        self._take(lay_out(scene))
+        self._take(
+            lay_out(scene) if hierarchy == "stored" else lay_out_rebuilt(scene, self._builders(threads))
+        )
+
+    def _builders(self, threads: int | None) -> int:
+        """Threads to build with: as many as trace on a CPU; beside a GPU, two unless one was asked for."""
+        return min(2, threads or 2) if self._on_gpu else self._mesh.size
 
     def _take(self, layout: Layout) -> None:
         self._layout = layout
@@ -79,23 +99,33 @@ class Tracer:
         """
         rays = checked_rays(origins, directions, t_max)
         count = len(rays[0])
-        t, u, v = (np.zeros(count, np.float32) for _ in range(3))
-        face, triangle = np.zeros(count, np.int32), np.zeros(count, np.int32)
+        t, u, v = np.full(count, np.inf, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+        face, triangle = np.full(count, MISS), np.full(count, MISS)
+        dropped = np.zeros(count, np.uint8)
         counted = np.zeros(count if steps else 0, np.int32)
-        for part, traced in stream(self._scene, rays, self._mesh, self._options(any_hit=False, steps=steps)):
-            t[part], face[part] = traced[:2]
-            if steps:
-                counted[part] = traced[2]
-            _check_ended(face[part])
-            self._weigh(rays[0][part], rays[1][part], face[part], u[part], v[part], triangle[part])
-        return Hits(t, face, u, v, triangle, counted if steps else None)
-
-    def _weigh(self, *rays_and_results: np.ndarray) -> None:
-        """Fill in u, v and triangle on this side, while the devices are at the next rays."""
-        origins, directions, face, *results = rays_and_results
         layout = self._layout
         blocks, scale = layout.arrays.blocks, layout.arrays.scale
-        weigh_hits(origins, directions, face, layout.place, blocks, scale, layout.triangle_of, *results)
+        for at, traced in self._stream(rays, dropped, self._options(any_hit=False, steps=steps)):
+            if steps:
+                counted[at] = traced[2]
+            _check_ended(traced[1])
+            # On this side, while the devices are at the next rays.
+            found_t, found_face = traced[:2]
+            found = (at, found_t, found_face, layout.place, blocks, scale, layout.triangle_of)
+            weigh_hits(rays[0], rays[1], *found, t, face, u, v, triangle)
+        if steps:
+            counted[dropped == 1] = 1
+        return Hits(t, face, u, v, triangle, counted if steps else None)
+
+    def _stream(
+        self, rays: Rays, dropped: np.ndarray, options: WalkOptions
+    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Trace rays; yield which ones are done, int32, and their results."""
+        if not options.batch:
+            yield from stream_ready(self._scene, self._layout.arrays, rays, dropped, self._mesh, options)
+            return
+        for part, traced in stream(self._scene, rays, self._mesh, options):
+            yield np.arange(part.start, part.stop, dtype=np.int32), traced
 
     def any_hit(
         self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
@@ -103,9 +133,10 @@ class Tracer:
         """Say of each ray whether it hits anything; arguments and errors as for `closest_hit`."""
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
-        for part, traced in stream(self._scene, rays, self._mesh, self._options(any_hit=True, steps=False)):
+        dropped = np.zeros(len(rays[0]), np.uint8)
+        for at, traced in self._stream(rays, dropped, self._options(any_hit=True, steps=False)):
             _check_ended(traced[1])
-            hit[part] = traced[1] >= 0
+            hit[at] = traced[1] >= 0
         return hit
 
     def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:

@@ -1,10 +1,12 @@
 """Tracing against embreex in the same run, one thread each: camera rays and ambient occlusion rays.
 
-    python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--record] [--note TEXT]
+    python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--hierarchy both] [--record]
+        [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
 occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
-any hit. The two tracers take turns; a ratio is the median of the ratios of runs next to each other in time.
+any hit; through the stored hierarchy of the scene, a rebuilt one, or both. The two tracers take turns; a
+ratio is the median of the ratios of runs next to each other in time.
 """
 
 import os
@@ -27,6 +29,7 @@ import striptools
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
+from striptools.trace.tracer import HierarchyKind
 
 PIXELS = 1024
 TILE = 8
@@ -60,12 +63,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--hierarchy", choices=("stored", "rebuilt", "both"), default="both")
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--note", default="")
     arguments = parser.parse_args()
     for path in arguments.models:
         scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
-        rows = measure(path.stem, scene, arguments.repeats, arguments.note)
+        kinds = ("stored", "rebuilt") if arguments.hierarchy == "both" else (arguments.hierarchy,)
+        rows = [
+            row
+            for kind in kinds
+            for row in measure(path.stem, scene, kind, arguments.repeats, arguments.note)
+        ]
         for row in rows:
             peer = f", {row.peer} {row.peer_value:.3g}, ratio {row.ratio:.3f}" if row.peer_value else ""
             sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.3g} {row.unit}{peer} {row.note}\n")
@@ -75,18 +84,20 @@ def main() -> int:
     return 0
 
 
-def measure(name: str, scene: Scene, repeats: int, note: str) -> list[Row]:
+def measure(name: str, scene: Scene, hierarchy: HierarchyKind, repeats: int, note: str) -> list[Row]:
     """Build both tracers, then let them take turns on each kind of ray."""
-    Tracer(scene, device="cpu", threads=1)
+    Tracer(scene, device="cpu", threads=1, hierarchy=hierarchy)
     start = time.perf_counter()
-    tracer = Tracer(scene, device="cpu", threads=1)
+    tracer = Tracer(scene, device="cpu", threads=1, hierarchy=hierarchy)
     build = time.perf_counter() - start
     corners = scene.positions[scene.faces()]
     start = time.perf_counter()
     peer = Embree(corners)
     peer_build = time.perf_counter() - start
     count = scene.triangle_count
-    rows = [Row("trace", name, count, "tracer build", build, "s", "embreex", peer_build, build / peer_build)]
+    note = "; ".join(filter(None, [f"{hierarchy} hierarchy", note]))
+    ratio = build / peer_build
+    rows = [Row("trace", name, count, "tracer build", build, "s", "embreex", peer_build, ratio, note)]
     camera = tiled_camera_rays(scene)
     occlusion = occlusion_rays(corners, camera, peer.closest(*camera))
     calls: list[tuple[str, Rays, Callable, Callable]] = [

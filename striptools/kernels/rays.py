@@ -1,0 +1,184 @@
+"""Kernel that readies rays for the walk on a CPU: what `trace.walk_wide` prepares, and the visit to the root.
+
+Rays that miss every child of the root end here, and never reach the device. The arithmetic is that of
+`trace.walk_wide.prepared_rays`, bit for bit, denormals read and written as zeros.
+"""
+
+import numpy as np
+from numba import njit
+
+from striptools.kernels.wide import EMPTY, WIDTH
+
+ROW = 24
+"""Words of a ready ray: 17 float32, then 7 int32; see `trace.walk_wide.Ready`."""
+
+ONE = np.float32(1)
+ZERO = np.float32(0)
+LARGEST = np.float32(np.finfo(np.float32).max)
+LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
+FAR_FACTOR = np.float32(1 + 2**-21)
+MARGIN = np.float32(2**-21)
+TINY = np.float32(2**-60)
+SLACK = np.float32(1 + 2**-20)
+HIGHEST_BIT = np.array([max(k.bit_length() - 1, 0) for k in range(2**WIDTH)], np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def flushed(value):
+    """Zero for a denormal float32; what is not a number stays so."""
+    return ZERO if abs(value) < LEAST_NORMAL else value
+
+
+@njit(cache=True, nogil=True)
+def smaller(a, b):
+    """The smaller of two, b where they do not compare."""
+    return a if a < b else b
+
+
+@njit(cache=True, nogil=True)
+def larger(a, b):
+    """The larger of two, b where they do not compare."""
+    return a if a > b else b
+
+
+@njit(cache=True, nogil=True)
+def picked(x, y, z, axis):
+    """The coordinate along an axis."""
+    return x if axis == 0 else (y if axis == 1 else z)
+
+
+@njit(cache=True, nogil=True)
+def steep(way):
+    """A direction component, or a tiny one of the same sign for one too small to cross the scene."""
+    tiny = -TINY if way < ZERO else TINY
+    return tiny if abs(way) < TINY else way
+
+
+@njit(cache=True, nogil=True)
+def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
+    """The root's lanes that a ray meets, as bits in the order of visits, the nearest highest."""
+    lanes = np.int32(0)
+    for lane in range(WIDTH):
+        ax = root[0, lane] * ix - lx
+        ay = root[1, lane] * iy - ly
+        az = root[2, lane] * iz - lz
+        bx = root[3, lane] * ix - hx
+        by = root[4, lane] * iy - hy
+        bz = root[5, lane] * iz - hz
+        entry = larger(larger(smaller(ax, bx), smaller(ay, by)), larger(smaller(az, bz), ZERO))
+        leaving = smaller(larger(ax, bx), smaller(larger(ay, by), larger(az, bz))) * FAR_FACTOR
+        bit = np.int32(1) << (np.int32(lane) ^ mirror)
+        lanes |= bit if entry <= smaller(limit, leaving) else np.int32(0)
+    return lanes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ready_rays(
+    origins, directions, t_max, begin, scale, reach, root, children, visit, rays, words, at, dropped
+):
+    """Ready rays from `begin` on until the places are full or there are none left.
+
+    Args:
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+        t_max: (r,) float32.
+        begin: The first ray to take.
+        scale: float32 power of two that origins are multiplied by.
+        reach: float32, the largest scaled coordinate of the scene.
+        root: (7, 8) float32, the boxes of the root's children, NaN in empty lanes; row 6 is not read.
+        children: (8,) int32, the root's children.
+        visit: Whether to visit the root here; else every valid ray starts at it.
+        rays: (k, 24) float32, written, a row for each ray that has something to visit.
+        words: The same memory as int32.
+        at: (k,) int32, written: which ray each row is.
+        dropped: (r,) uint8, written for the rays taken: 0 has a row, 1 missed the root, 2 is no ray.
+
+    Returns:
+        The number of rows written, and the first ray not taken.
+    """
+    room = len(rays)
+    count = 0
+    for r in range(begin, len(origins)):
+        if count == room:
+            return count, r
+
+        # Scale the ray by powers of two; refuse what is no ray.
+        ox = flushed(flushed(origins[r, 0]) * scale)
+        oy = flushed(flushed(origins[r, 1]) * scale)
+        oz = flushed(flushed(origins[r, 2]) * scale)
+        dx = flushed(directions[r, 0])
+        dy = flushed(directions[r, 1])
+        dz = flushed(directions[r, 2])
+        largest = larger(larger(abs(ox), abs(oy)), abs(oz))
+        longest = larger(larger(abs(dx), abs(dy)), abs(dz))
+        far = flushed(t_max[r])
+        finite = (abs(ox) <= LARGEST) & (abs(oy) <= LARGEST) & (abs(oz) <= LARGEST)
+        finite &= (abs(dx) <= LARGEST) & (abs(dy) <= LARGEST) & (abs(dz) <= LARGEST)
+        if not (finite & (longest >= LEAST_NORMAL) & (far > ZERO)):
+            dropped[r] = 2
+            continue
+        exponent = min(max(np.float32(longest).view(np.int32) >> 23, 1), 253)
+        shorten = np.int32((254 - exponent) << 23).view(np.float32)
+        length = np.int32(exponent << 23).view(np.float32)
+        dx = flushed(dx * shorten)
+        dy = flushed(dy * shorten)
+        dz = flushed(dz * shorten)
+        far = flushed(flushed(far * length) * scale)
+
+        # Make the constants of the slab test.
+        margin = MARGIN * larger(largest, reach)
+        mirror = np.int32(7)
+        mirror ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
+        ix, iy, iz = ONE / steep(dx), ONE / steep(dy), ONE / steep(dz)
+        lx = flushed(flushed(ox + margin) * ix)
+        ly = flushed(flushed(oy + margin) * iy)
+        lz = flushed(flushed(oz + margin) * iz)
+        hx = flushed(flushed(ox - margin) * ix)
+        hy = flushed(flushed(oy - margin) * iy)
+        hz = flushed(flushed(oz - margin) * iz)
+
+        # Visit the root: a ray that meets none of its children is done.
+        child = np.int32(0)
+        lanes = np.int32(0)
+        if visit:
+            lanes = lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, far * SLACK, mirror)
+            if lanes == 0:
+                dropped[r] = 1
+                continue
+            order = np.int32(HIGHEST_BIT[lanes])
+            child = children[order ^ mirror]
+            lanes ^= np.int32(1) << order
+        dropped[r] = 0
+
+        # Write the row: slab, shear, distances, then axes, mirror and the place to start from.
+        z = 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
+        x = 0 if z == 2 else z + 1
+        y = 0 if x == 2 else x + 1
+        depth = picked(dx, dy, dz, z)
+        rays[count, 0] = lx
+        rays[count, 1] = ly
+        rays[count, 2] = lz
+        rays[count, 3] = hx
+        rays[count, 4] = hy
+        rays[count, 5] = hz
+        rays[count, 6] = ix
+        rays[count, 7] = iy
+        rays[count, 8] = iz
+        rays[count, 9] = picked(ox, oy, oz, x)
+        rays[count, 10] = picked(ox, oy, oz, y)
+        rays[count, 11] = picked(ox, oy, oz, z)
+        rays[count, 12] = flushed(picked(dx, dy, dz, x) / depth)
+        rays[count, 13] = flushed(picked(dx, dy, dz, y) / depth)
+        rays[count, 14] = ONE / depth
+        rays[count, 15] = far
+        rays[count, 16] = flushed(shorten / scale)
+        words[count, 17] = x
+        words[count, 18] = y
+        words[count, 19] = z
+        words[count, 20] = mirror
+        words[count, 21] = child ^ EMPTY
+        words[count, 22] = lanes
+        words[count, 23] = 1 if visit else 0
+        at[count] = r
+        count += 1
+    return count, len(origins)
