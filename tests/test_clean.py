@@ -1,3 +1,4 @@
+import time
 from fractions import Fraction
 
 import numpy as np
@@ -10,6 +11,7 @@ from striptools.errors import UsageError
 from striptools.kernels.degenerate import DOUBTFUL, NON_FINITE, REPEATED_VERTEX, USABLE
 from striptools.mesh.clean import (
     CleanOptions,
+    _repeated_faces,
     clean,
     has_zero_area,
     judge_faces,
@@ -282,6 +284,34 @@ def test_the_input_is_left_alone(shape):
     assert clean(mesh, CleanOptions(drop_duplicates=True)).mesh.notes == ("kept",)
     np.testing.assert_array_equal(mesh.positions, before[0])
     np.testing.assert_array_equal(mesh.faces, before[1])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_faces_crowded_on_few_least_vertices_are_compared_in_linear_time(threads):
+    # Ten faces and more for each of the first vertices and none for the others, as in a subdivided mesh.
+    def crowd(count):
+        random = np.random.default_rng(count)
+        far = random.integers(count // 10, count, (count, 2))
+        faces = np.column_stack([random.integers(0, count // 10, count), far[:, 0], far[:, 1]])
+        faces[:100] = np.roll(faces[-100:], 1, axis=1)
+        return faces.astype(np.int32)
+
+    def compare(faces):
+        keep = faces[:, 1] != faces[:, 2]
+        begin = time.process_time()
+        repeated = _repeated_faces(faces, keep, len(faces), threads)
+        return repeated, time.process_time() - begin
+
+    few, many = crowd(100_000), crowd(800_000)
+    repeated, _ = compare(few)
+    turned = np.take_along_axis(few, (np.argmin(few, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    _, first = np.unique(turned, axis=0, return_index=True)
+    expected = np.ones(len(few), bool)
+    expected[first] = False
+    expected[few[:, 1] == few[:, 2]] = False
+    np.testing.assert_array_equal(repeated, expected)
+    quick = min(compare(few)[1] for _ in range(3))
+    assert min(compare(many)[1] for _ in range(3)) < 40 * quick
 
 
 def test_the_dragon_loses_its_degenerate_faces_and_soup_its_copies(real_mesh):

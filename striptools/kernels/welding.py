@@ -131,13 +131,17 @@ def mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated):
             continue
 
         # Probe near the place of the least vertex first, where neighbours in the mesh are neighbours in the
-        # table; then, a fan may be large, from a slot that all three choose.
+        # table; then, for that place may be crowded far and wide, in steps and from a slot that all three
+        # choose.
         slot = (a - begin) * spread & mask
+        step = np.int64(1)
         known = table[slot]
         probes = 1
         while known >= 0 and (a, b, c) != least_first(faces, known):
-            slot = slot + 1 if probes != NEAR_PROBES else np.int64(mix_bits(a, b, c))
-            slot &= mask
+            if probes == NEAR_PROBES:
+                slot = np.int64(mix_bits(a, b, c))
+                step = np.int64(mix_bits(c, a, b)) | 1
+            slot = slot + step & mask
             known = table[slot]
             probes += 1
         if known < 0:

@@ -173,8 +173,9 @@ def _split_in_threads(
     smallest = max(SMALLEST_JOB, count // (16 * threads))
 
     def split(node: int, begin: int, end: int, depth: int) -> list[list[int]]:
-        # A large range is split once and its halves come back as jobs, for any thread that is free.
-        grain = end - begin - 1 if threads > 1 and end - begin > smallest else 0
+        # A large range is split once and its halves come back as jobs, for any thread that is free; its room
+        # for right sides is given back before the tree grows.
+        grain = end - begin - 1 if end - begin > smallest else 0
         jobs = np.zeros((2, 4), np.int64)
         found = kernels.split_ranges(rows, tree, node, begin, end, depth, *limits, grain, jobs)
         return jobs[:found].tolist()
