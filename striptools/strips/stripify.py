@@ -166,7 +166,8 @@ def _jobs(cut: Cut) -> list[tuple[int, int]]:
 #   normal, in blocks of 256            1.077/1.113   1.086/1.092   1.099/1.150    1.073/1.093
 #
 # Blocks come first because a strip that knows its block is compact in it; chunks alone take 1 to 7 %
-# off the cost of linking. Neutral moves pay twice: what they save is room under `rise` for more merges. On the dragon,
+# off the cost of linking. Neutral moves pay twice: what they save is room under `rise` for more merges.
+# On the dragon,
 # price 1.0 gives 1.052/1.135, 1.15 1.049/1.143, 1.3 1.047/1.149. Splits aligned with blocks of 256, dragon,
 # by the most blocks of an aligned range: none fills 68 % of a block, duplicates 1.245 vertices a vertex and
 # costs 1.081; 4: 85 %, 1.224, 1.086; 8: 91 %, 1.220, 1.089; 12: 94 %, 1.2196, 1.093.
