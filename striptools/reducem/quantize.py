@@ -165,8 +165,8 @@ def quantise(
     mesh = cleaned.mesh
     already = cleaned.weld_error + math.sqrt(3.0) * cleaned.largest_rounding * SLACK
     exponent = _exponent(mesh, precision, already)
-    moved = Mesh(snap(mesh.positions, exponent), mesh.faces, mesh.notes)  # pyright:
-    ignore[reportArgumentType] again = clean(moved, CleanOptions(drop_duplicates=drop_duplicates), threads)
+    moved = Mesh(snap(mesh.positions, exponent), mesh.faces, mesh.notes)  # pyright: ignore
+    again = clean(moved, CleanOptions(drop_duplicates=drop_duplicates), threads)
     counts = cleaned.counts | {
         "quantised_repeated_vertex": again.counts["repeated_vertex"],
         "quantised_zero_area": again.counts["zero_area"],

@@ -10,6 +10,7 @@ asked for: its padding and checksums, its length by the counts, then the rules o
 import io
 import json
 import mmap
+import os
 import re
 import stat
 import zlib
@@ -93,10 +94,8 @@ def _mapped(file: IO[bytes]) -> memoryview | None:
     The mapping is private and may be written to, because kernels would be compiled a second time for arrays
     that may not.
     """
-    status = file.fileno(), 0
-    import os
-
-    if not stat.S_ISREG(os.fstat(status[0]).st_mode) or os.fstat(status[0]).st_size < layout.HEADER.size:
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode) or status.st_size < layout.HEADER.size:
         return None
     return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
 
@@ -346,9 +345,8 @@ def _table(view: memoryview, where: str) -> dict[bytes, _Entry]:
 def _entry(row: np.void, before: int, where: str) -> _Entry:
     # NumPy drops trailing zero bytes of a string; a kind keeps its four.
     kind = bytes(row["kind"]).ljust(4, b"\0")
-    rest = [int(row[name]) for name in layout.ENTRY.dtype.names[1:]]  # pyright:
-    ignore[reportOptionalSubscript] return _Entry(kind, before, f"{where}: {kind.decode('ascii',
-    'backslashreplace')}", *rest)
+    rest = [int(row[field.name]) for field in layout.ENTRY.fields[1:]]
+    return _Entry(kind, before, f"{where}: {kind.decode('ascii', 'backslashreplace')}", *rest)
 
 
 def _check_entry(entry: _Entry) -> None:

@@ -35,7 +35,7 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The nodes, and for each slot, (m, 8), whether it is inner or a leaf, and which node or leaf it names."""
+    """The nodes, and of each slot, (m, 8), whether it is inner or a leaf, and which one it names."""
 
     section: Section
     rows: np.ndarray
