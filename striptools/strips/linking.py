@@ -45,7 +45,8 @@ def link_faces(
         adjacency: Rings of half-edges of `faces`.
         faces: (n, 3) int32.
         tree: Object tree with one face an item.
-        options: Only the cap is looked at, edges run the same way are never crossed; the defaults of OrderingOptions when left out.
+        options: Only the cap is looked at, for no flips are made; the defaults of OrderingOptions when left
+            out.
 
     Returns:
         Sequences of at most max_length faces, each from its end that comes first in the tree, in the order of

@@ -8,8 +8,8 @@ behind the edge by which the strip leaves the triangle (a, b, c) before it:
     turn bit 1: by c -> a, the next triangle is (a, c, w)
 
 Both run the shared edge against the triangle before, so that a strip of faces of one winding has the winding
-of its source. The edge a -> b, by which a triangle was entered, is never left by. The turn bit of a strip's FIRST
-triangle is unused and is 0. An encoder turns the first triangle so that the bit of the SECOND is 0; a
+of its source. The edge a -> b, by which a triangle was entered, is never left by. The turn bit of a strip's
+FIRST triangle is unused and is 0. An encoder turns the first triangle so that the bit of the SECOND is 0; a
 decoder takes either.
 
 A face that runs the shared edge the same way as the one before is walked over with its first two corners
@@ -30,11 +30,11 @@ Source: Lauterbach et al., ReduceM (EGSR 2008), step "Strip output", which print
 3. Where two faces share more than one edge, any crossing that leaves no face by its entry edge is found.
 4. A strip may cross an edge that both faces run the same way, for a flip bit.
 
-**Classic strips** (classic_strips) have no flips: strips are cut where the winding changes. Triangle k of a strip is indices k, k + 1, k + 2, with the first two
-swapped for odd k. Equal turns in a row cost one repeated vertex each. Strips are set apart by a restart index
-or by two repeated vertices; where a strip begins with the vertex that ended the one before, it follows at
-once, which saves the restart. Which strip follows, and from which end each is written, is free and chosen
-greedily.
+**Classic strips** (classic_strips) have no flips: strips are cut where the winding changes. Triangle k of a
+strip is indices k, k + 1, k + 2, with the first two swapped for odd k. Equal turns in a row cost one repeated
+vertex each. Strips are set apart by a restart index or by two repeated vertices; where a strip begins with
+the vertex that ended the one before, it follows at once, which saves the restart. Which strip follows, and
+from which end each is written, is free and chosen greedily.
 
 Cost: O(n), all of it.
 """
@@ -201,11 +201,11 @@ class ClassicCount:
 def classic_strips(strips: Strips, restart: int | None = RESTART) -> Counts:
     """Classic alternating strips as one index list.
 
-    Every triangle keeps its winding: strips are cut where their flip bit changes. Each strip is written from the end whose first turn fits its place, and
-    strips are put in an order in which many begin with the vertex that ended the one before: these follow at
-    once, and their common vertex stands twice. Other strips are set apart by `restart`, or by the last vertex
-    and the next one once more. Repeated vertices make triangles of no area that decode_classic and every
-    renderer drop.
+    Every triangle keeps its winding: strips are cut where their flip bit changes. Each strip is written from
+    the end whose first turn fits its place, and strips are put in an order in which many begin with the
+    vertex that ended the one before: these follow at once, and their common vertex stands twice. Other strips
+    are set apart by `restart`, or by the last vertex and the next one once more. Repeated vertices make
+    triangles of no area that decode_classic and every renderer drop.
 
     Args:
         strips: Generalised strips of faces with three different vertices.
