@@ -155,10 +155,7 @@ class Scene:
 
     @cached_property
     def _faces(self) -> Faces:
-        faces = decode_strips(self.vertices, self.turns, self.starts, threads=every_core())
-        if self.flips is not None:
-            faces[self.flips, :2] = faces[self.flips, 1::-1]
-        return faces
+        return decode_strips(self.vertices, self.turns, self.starts, self.flips, threads=every_core())
 
     def faces(self) -> Faces:
         """Decode the strips, once; later calls give the same array.
