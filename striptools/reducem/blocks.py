@@ -194,7 +194,8 @@ def check_headers(blocks: Blocks, triangle_count: int, where: str = "scene") -> 
     Raises:
         UnreadableSceneError: They do not.
     """
-    _refuse(kernels.header_flaw(blocks.headers, blocks.words, triangle_count), "BLKH", where)
+    if blocks.count:
+        _refuse(kernels.header_flaw(blocks.headers, blocks.words, triangle_count), "BLKH", where)
 
 
 def _starts(counts: np.ndarray) -> Counts:
