@@ -141,12 +141,13 @@ def _places(inspection: Inspection, blocks: _Blocks) -> None:
     word = np.cumsum(length) - length
     inspection.found_where("RDM601", blocks.first != first, place, lambda i: headers.at(32 * i))
     blocks.whole &= blocks.word == word
-    if inspection.found_where("RDM602", blocks.word != word, place, lambda i: headers.at(32 * i + 4)):
-        return
+    misplaced = inspection.found_where("RDM602", blocks.word != word, place, lambda i: headers.at(32 * i + 4))
     end = int(length.sum())
     wanted = 4 * (end + 16 + -(end + 16) % 16)
     if len(blocks.data.data) != wanted:
         inspection.found("RDM606", f"BLKD: {len(blocks.data.data)} bytes, not {wanted}", blocks.data.offset)
+    if misplaced:
+        return
     used = 32 * word + blocks.bits
     loose = np.zeros(len(used), np.bool_)
     inside = 32 * (word + length) <= 32 * (len(blocks.words) - 2)
