@@ -175,9 +175,10 @@ def coordinates(draw, count: int):
 
 @st.composite
 def plans(draw):
-    """A valid file of a few blocks, with or without a remap; boxes are stored where it is one block."""
-    made = draw(st.lists(blocks(), min_size=1, max_size=1))
+    """A valid file of a few blocks, with or without a remap and stored boxes."""
+    made = draw(st.lists(blocks(), min_size=1, max_size=3))
     count = sum(block.count for block in made)
     faces = draw(st.permutations(range(count + 2)))[:count]
     remap = [(face, draw(st.integers(0, 2))) for face in faces] if draw(st.booleans()) else None
-    return make.Plan(made, remap=remap, record={"source_face_count": count + 2})
+    stored, cells = draw(st.booleans()), make.fitting_cells(made)
+    return make.Plan(made, stored, remap=remap, cells=cells, record={"source_face_count": count + 2})

@@ -1,5 +1,6 @@
 """Laws of decoders: whatever bytes a file has, it is refused with a code or is a valid scene, soon."""
 
+import io
 import time
 import tracemalloc
 
@@ -7,6 +8,7 @@ import pytest
 from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import scenes
 
 from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene
@@ -81,6 +83,14 @@ def test_the_plans_decode_to_their_points_and_strips(plan):
     wanted = make.decoding(plan)
     assert ["".join(f"{bits:08x}" for bits in vertex) for vertex in decoded.vertices] == wanted["vertices"]
     assert decoded.faces == wanted["faces"]
+
+
+@given(scenes(), st.booleans())
+def test_scenes_of_the_pipeline_are_read_alike(drawn, stored):
+    _, scene = drawn
+    file = io.BytesIO()
+    (scene.storing_boxes() if stored else scene).save(file)
+    assert agree(file.getvalue()) == set()
 
 
 @given(st.binary(max_size=400))
