@@ -6,8 +6,8 @@ import struct
 import numpy as np
 import pytest
 from conftest import ROOT
-from formats import cases, make, reference
 
+from formats import cases, make, reference
 from striptools.reducem import layout
 from striptools.reducem.issues import ISSUES, catalogue
 from striptools.reducem.reader import read_scene
@@ -115,7 +115,7 @@ def test_the_limits_are_the_specifications():
     # A block's stream is longest with all its triangles apart, and 32 bits for each coordinate.
     words = -(-(3 * 256 + 3 * 256 * 8 + 256 * 96) // 32)
     assert f"no more than {4 * words}b + 128" in SPEC
-    assert layout.MOST_BLOCK_BYTES == 4 * words
+    assert 4 * words == layout.MOST_BLOCK_BYTES
 
 
 def test_the_issues_are_the_catalogue():

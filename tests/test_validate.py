@@ -9,8 +9,8 @@ import sys
 
 import numpy as np
 import pytest
-from formats import VECTORS, cases, make
 
+from formats import VECTORS, cases, make
 from striptools.reducem.issues import ISSUES
 from striptools.reducem.validate import validate
 from striptools_cli import app
@@ -138,8 +138,8 @@ def test_a_fault_ends_in_1_and_one_line(run):
     assert (code, err) == (1, "")
     assert out.splitlines() == [
         "error_negative.rdm: NOT valid, 1 kind of error",
-        f"  RDM202 1  error, byte {192 + 32}, SCEN: the error bound is negative or not finite (SPEC 4.1; report it "
-        "to the maker of the program that wrote the file)",
+        f"  RDM202 1  error, byte {192 + 32}, SCEN: the error bound is negative or not finite "
+        "(SPEC 4.1; report it to the maker of the program that wrote the file)",
     ]
 
 

@@ -149,7 +149,7 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
     outside = nodes.is_inner & ((nodes.child < least) | (nodes.child >= most))
     at = nodes.section.at
     wrong = inspection.found_where(
-        "RDM701", outside.any(axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
+        "RDM701", np.any(outside, axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
     )
     parent, slot = np.nonzero(nodes.is_inner & ~outside)
     child = nodes.child[parent, slot]
