@@ -98,7 +98,8 @@ def known(codes: list[str], errors: set[str]) -> bool:
 
 def alike(code: str, other: str) -> bool:
     """Whether readers may give these codes to one flaw: of one part, or of a count and what is counted."""
-    return code[:4] == other[:4] or {code, other} in ({"RDM114", "RDM606"}, {"RDM201", "RDM601"})
+    pairs = ({"RDM114", "RDM606"}, {"RDM201", "RDM601"}, {"RDM704", "RDM801"})
+    return code[:4] == other[:4] or {code, other} in pairs
 
 
 def assert_same(scene, decoded) -> None:

@@ -85,12 +85,20 @@ def test_the_plans_decode_to_their_points_and_strips(plan):
     assert decoded.faces == wanted["faces"]
 
 
-@given(scenes(), st.booleans())
-def test_scenes_of_the_pipeline_are_read_alike(drawn, stored):
-    _, scene = drawn
+@given(scenes())
+def test_scenes_of_the_pipeline_are_read_alike(drawn):
     file = io.BytesIO()
-    (scene.storing_boxes() if stored else scene).save(file)
+    drawn[1].save(file)
     assert agree(file.getvalue()) == set()
+
+
+@given(scenes())
+def test_archives_of_the_pipeline_are_valid(drawn):
+    pytest.importorskip("zstandard")
+    file = io.BytesIO()
+    drawn[1].save(file, archive=True)
+    assert agree(file.getvalue()) == set()
+    assert validate(file.getvalue()) == []
 
 
 @given(st.binary(max_size=400))

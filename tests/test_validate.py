@@ -90,6 +90,18 @@ def test_every_finding_has_a_remedy_and_a_clause():
         assert issue.severity in ("error", "information")
 
 
+def test_without_its_codec_an_archive_is_passed_over_and_said_to_be(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    findings = validate(VECTORS / "valid" / "archive.rdm")
+    assert [(f.issue.code, f.place) for f in findings] == [
+        ("RDM123", kind) for kind in ("BLKH", "BLKD", "NODE", "RUNS", "RMAP", "META")
+    ]
+    assert {f.issue.severity for f in findings} == {"information"}
+    # What the frame says of itself is judged without it.
+    for name in ("packed_cut", "packed_twice", "packed_dictionary", "packed_window", "packed_other_length"):
+        assert "RDM121" in [f.issue.code for f in validate(VECTORS / "invalid" / f"{name}.rdm")]
+
+
 def test_a_large_chain_of_nodes_ends_soon():
     whole = ((0, 0, 0), (255, 255, 255))
     nodes = [make.Node([make.Slot(True, *whole)], base=i + 1) for i in range(20_000)]

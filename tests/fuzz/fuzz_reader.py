@@ -5,8 +5,8 @@ Needs the package atheris beside those of the extra dev; from the root of the re
     python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other of libFuzzer's]
 
 The conformance vectors are the corpus to start with. The last byte of an input says what is made of it: a
-file as it is, one whose checksums, or lengths and places too, are mended, so that mutations get behind them, or
-changes of a few bytes of a valid vector. With `--keep` a finding is written to the folder, once for each
+file as it is, one whose checksums, or lengths and places too, are mended, so that mutations get behind them,
+or changes of a few bytes of a valid vector. With `--keep` a finding is written to the folder, once for each
 place where it comes up, and the run goes on.
 """
 
