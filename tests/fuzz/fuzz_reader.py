@@ -1,6 +1,6 @@
 """Fuzz the readers of scene files: reader, validator and reference reader must say the same of any bytes.
 
-Needs the package atheris beside those of the extra dev; from the root of the repository:
+Needs the extras dev and fuzz; from the root of the repository:
 
     python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other of libFuzzer's]
 
@@ -16,6 +16,7 @@ import struct
 import sys
 import tempfile
 import traceback
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -101,6 +102,7 @@ def watched(folder: Path, check: Callable[[bytes], None]) -> Callable[[bytes], N
 
 def main() -> None:
     """Run libFuzzer on the vectors and what the command line names."""
+    warnings.simplefilter("error")
     arguments = sys.argv[1:]
     check = look
     if arguments[:1] == ["--keep"]:
