@@ -2,7 +2,7 @@
 
 Needs the extras dev and fuzz; from the root of the repository:
 
-    python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other of libFuzzer's]
+    python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other libFuzzer flags]
 
 The conformance vectors are the corpus to start with. The last byte of an input says what is made of it: a
 file as it is, one whose checksums, or lengths and places too, are mended, so that mutations get behind them,
