@@ -4,6 +4,7 @@ Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 6 blocks, 7
 Those of 3 and 4 belonged to formats before 0.3 and are not used again.
 """
 
+import sys
 from dataclasses import dataclass
 
 from striptools.errors import UnreadableSceneError
@@ -28,10 +29,11 @@ class Issue:
 
 @dataclass(frozen=True)
 class Finding:
-    """An issue found in a file, and where."""
+    """An issue found in a file, and where; `offset` is the byte of the file, None where none is to blame."""
 
     issue: Issue
     where: str
+    offset: int | None = None
 
     def __str__(self) -> str:
         """Give one line for the user."""
@@ -107,12 +109,14 @@ _ALL = (
     _flaw("RDM705", "4.4", "a slot is neither empty nor a box"),
     _flaw("RDM706", "4.4", "a node without inner children or without leaves has a first one"),
     _flaw("RDM707", "4.4", "a box does not hold what is below it"),
+    _flaw("RDM708", "4.4", "a node has no child"),
     _flaw("RDM801", "4.5", "the runs of a block do not begin where those before them end"),
     _flaw("RDM802", "4.5", "a run is not in one strip of its block, or longer than the longest run"),
     _flaw("RDM803", "4.5", "a triangle is not in exactly one run"),
     _flaw("RDM901", "4.7", "the metadata are no JSON object in UTF-8"),
     _flaw("RDM902", "4.7", "the metadata are longer than 2^20 bytes"),
     _flaw("RDM903", "4.7", "generator, source or unit is not a string"),
+    _flaw("RDM904", "4.7", "the metadata are nested deeper than 32 levels"),
 )
 
 ISSUES = {issue.code: issue for issue in _ALL}
@@ -136,9 +140,12 @@ _HEAD = """\
 
 What `striptools.reducem.validate` finds and what the reader refuses. A file is valid when it has no issue of
 severity `error`. The clause is the section of SPEC.md that rules the flaw out. Codes are never used again for
-something else; those from RDM301 to RDM499 were of formats before 0.3. This file is `catalogue()` of
-`striptools/reducem/issues.py`, and a test compares the two.
+something else; those from RDM301 to RDM499 were of formats before 0.3. `python -m striptools.reducem.issues`
+prints this file, and a test compares the two.
 
 | code | severity | clause | message | remedy |
 |---|---|---|---|---|
 """
+
+if __name__ == "__main__":
+    sys.stdout.write(catalogue())
