@@ -72,9 +72,7 @@ def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def ready_rays(
-    origins, directions, t_max, begin, frame, root, children, visit, rays, words, at, dropped
-):
+def ready_rays(origins, directions, t_max, begin, frame, root, children, visit, rays, words, at, dropped):
     """Ready rays from `begin` on until the places are full or there are none left.
 
     Args:

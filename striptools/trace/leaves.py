@@ -12,7 +12,6 @@ from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
-from striptools.partition.boxes import face_boxes
 from striptools.partition.object_split import split_objects
 from striptools.trace.box import MARGIN
 from striptools.trace.walk import DONE, NO_FACE, Frame
@@ -69,13 +68,13 @@ class Layout:
 
 def lay_out(scene: "Scene", threads: int = 1) -> Layout:
     """Lay a scene out for the walk through its own hierarchy."""
-    boxes = face_boxes(scene.positions, scene.faces())
+    boxes = scene.triangle_boxes(threads)
     return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
 def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
-    boxes = face_boxes(scene.positions, scene.faces())
+    boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
     tree = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size)
     return lay_out_wide(scene, collapse(tree), split.order)
@@ -143,7 +142,7 @@ def scale_of(scene: "Scene") -> np.float32:
 
     Scaling by it is exact, and the model's unit no longer matters.
     """
-    largest = float(np.abs(scene.positions).max())
+    largest = _largest(scene)
     if largest < float(np.finfo(np.float32).tiny):
         return np.float32(1)
     exponent = int(np.floor(np.log2(largest)))
@@ -152,7 +151,12 @@ def scale_of(scene: "Scene") -> np.float32:
 
 def reach_of(scene: "Scene", scale: np.float32) -> np.float32:
     """The largest scaled coordinate."""
-    return np.float32(np.abs(scene.positions).max() * scale)
+    return np.float32(_largest(scene) * float(scale))
+
+
+def _largest(scene: "Scene") -> float:
+    """The largest coordinate."""
+    return float(np.abs([scene.low, scene.high]).max())
 
 
 def size_class(count: int, steps: int = 4) -> int:

@@ -24,12 +24,14 @@ class PackedLayout:
 
     Attributes:
         arrays: For the device, as NumPy arrays.
+        blocks: How many blocks there are.
         rotations: (n,) uint8 of the remap, or (0,).
         decode: How leaves are decoded.
         depth: The most nodes on a way from the root down.
     """
 
     arrays: PackedScene
+    blocks: int
     rotations: np.ndarray
     decode: Decode
     depth: int
@@ -63,7 +65,8 @@ class PackedLayout:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
         triangle = traced[2] if len(traced[2]) else traced[1]
-        kept = (arrays.headers, arrays.words, self.rotations, arrays.frame.scale, int(arrays.scale_exponent))
+        headers = arrays.headers[: self.blocks]
+        kept = (headers, arrays.words, self.rotations, arrays.frame.scale, int(arrays.scale_exponent))
         kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], triangle, *kept, *found)
 
 
@@ -92,7 +95,7 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     )
     count = len(packed.nodes)
     depth = int(kernels.depth_of(nodes[:count], planes[:count], packed.top_count))
-    return PackedLayout(arrays, rotations, decode_of(blocks.headers, exponent), depth)
+    return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks.headers, exponent), depth)
 
 
 def decode_of(headers: np.ndarray, scale_exponent: int) -> Decode:

@@ -431,7 +431,9 @@ def _walk_group(
     places = tuple(ray.start for ray in rays)
     none = jnp.full(WIDTH, MISS, jnp.int32)
     named = scene.has_faces and not options.any_hit
-    bests = tuple(Best(ray.t_max, jnp.full(WIDTH, ray.t_max), none, none if named else none[:0]) for ray in rays)
+    bests = tuple(
+        Best(ray.t_max, jnp.full(WIDTH, ray.t_max), none, none if named else none[:0]) for ray in rays
+    )
     steps = tuple(ray.visited for ray in rays) if options.count_steps else ()
 
     def nodes_then_leaves(carried: tuple[_State, tuple[Best, ...]]) -> tuple[_State, tuple[Best, ...]]:

@@ -145,9 +145,7 @@ class PackedScene(NamedTuple):
         run = _at(self.first_run, block) + (head[1] >> 24) + rank
         return block, _at(self.runs, run).astype(jnp.uint32)
 
-    def _corners(
-        self, header: Array, first: Array, t: Array, flips: bool
-    ) -> tuple[Array, Array, Array]:
+    def _corners(self, header: Array, first: Array, t: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of the triangles t (8,) of a block, all in the strip of `first`."""
         word, counts = header[1], header[2]
         triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1

@@ -59,6 +59,7 @@ class WideScene(NamedTuple):
         face = lax.bitcast_convert_type(bits, jnp.int32)
         return closer_of(best, t, face, face)
 
+
 # Notes
 #
 # Tried on the dragon's strip hierarchy, one thread, Zen 4, and lost (time against what stands here): leaf
