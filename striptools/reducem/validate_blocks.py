@@ -83,15 +83,16 @@ def inspect_blocks(inspection: Inspection) -> Geometry | None:
     """Look at the blocks; gives their geometry where all of them could be decoded and are sound."""
     blocks = _headers(inspection, inspection.sections["BLKH"], inspection.sections["BLKD"])
     _places(inspection, blocks)
-    n = int(blocks.k.sum())
+    counted = int(blocks.k.sum()) == int.from_bytes(inspection.sections["SCEN"].data[:4], "little")
+    if not counted:
+        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
     parts = [_decode(inspection, blocks, chunk) for chunk in _chunks(blocks)]
     sound = [part for part in parts if part is not None]
     if not blocks.whole.all() or len(sound) < len(parts):
         return None
     begins, low, high, lowest, highest = (np.concatenate(column) for column in zip(*sound, strict=True))
     _bounds(inspection, lowest, highest)
-    if n != int.from_bytes(inspection.sections["SCEN"].data[:4], "little"):
-        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
+    if not counted:
         return None
     return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, low, high)
 
@@ -196,7 +197,7 @@ def _decode(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> tuple
         "RDM614",
         (a == b) | (b == c) | (c == a),
         lambda i: f"BLKD: block {chunk[row[i]]}, triangle {t[i]}",
-        lambda i: blocks.data.at(4 * blocks.word[chunk[row[i]]]),
+        lambda i: blocks.data.at(4 * int(blocks.word[chunk[row[i]]])),
     )
     offsets = (np.cumsum(blocks.q[chunk]) - blocks.q[chunk])[row]
     positions = [vertices[corner + offsets] for corner in corners]
@@ -267,7 +268,7 @@ def _indices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.n
         "RDM613",
         used < q,
         lambda i: f"BLKD: block {chunk[i]}",
-        lambda i: blocks.bit_at(blocks.base[chunk[i]] + (2 + blocks.f[chunk[i]]) * blocks.k[chunk[i]]),
+        lambda i: blocks.bit_at(int((blocks.base + (2 + blocks.f) * blocks.k)[chunk[i]])),
     )
     return None if broken else index
 
