@@ -89,7 +89,6 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
         starts[:strip_count].copy(),
         starts[1 : strip_count + 1] - starts[:strip_count],
         np.empty(strip_count, np.float64),
-        np.empty(strip_count, np.float64),
         np.empty(strip_count, np.int32),
         np.empty((count, 2), np.int32),
         mate,
@@ -98,7 +97,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
         for place in range(strips.length[s]):
             strips.where[rows[strips.begin[s] + place], 0] = s
             strips.where[rows[strips.begin[s] + place], 1] = place
-    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32))
+    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32), np.empty(LONGEST, np.int32))
     before, after = search_range(strips, ground, most, deepest, neutral, price, rise, passes, leaves)
     # Write the strips by the place of their first faces, each turned the cheaper way.
     k = 0

@@ -24,21 +24,22 @@ MOST_ROTATIONS = 400
 TOP_WEIGHT = 4.0
 """What the hierarchy over the strips costs for a strip, in areas of the strip's box."""
 
-Ground = namedtuple("Ground", "ring faces boxes mirror room")
+Ground = namedtuple("Ground", "ring faces boxes mirror room line")
 """What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`, and
-room (LONGEST, 6) float32 for evaluations."""
+for evaluations room (LONGEST, 6) float32 and line (LONGEST,) int32."""
 
-Strips = namedtuple("Strips", "rows begin length cost kept changed where mate")
-"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, cost (s,) float64
-of the row it has now (negative: not known) and kept (s,) that of the last accepted one, and changed (s,)
-int32, when that was; where (n, 2) int32, strip and place of each face; mate (3n,) int32, the linked half-edge
-or -1."""
+Strips = namedtuple("Strips", "rows begin length kept changed where mate")
+"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, kept (s,) float64,
+its cost, and changed (s,) int32, when it was changed last; where (n, 2) int32, strip and place of each face;
+mate (3n,) int32, the linked half-edge or -1."""
 
-Search = namedtuple("Search", "level path saved touched best")
-"""Working room of one search: level (k, 4) int32 by depth: strip, slot, half-edge, side that are tried now;
-path (k, 10) int32, the rotations done: half-edges h, g, cut, its mate, then strip, begin, length of a and of
-b; saved (k, 2) float64 their costs; touched (k,) int32 strips; best (k, 3) int32 the rotations h, g, cut of
-the best find, then its merge."""
+Search = namedtuple("Search", "level path saved shape cost pieces moves best")
+"""Working room of one search: level (k, 4) int32 by depth: next move, how many, virtual row, its end face; path (k, 14) int32, the rotations done: half-edges h, g, cut, its mate, rows a and b, how many
+rows there were, begin, count, length of a and of b, the top of the pieces; saved (k, 2) float64 their costs; shape (k, 4) int32
+by virtual row: strip, begin and count of its pieces, length; cost (k,) float64 (negative: not known); pieces
+(p, 2) int32: first and last place in the arena; moves (k, MOST_ROTATIONS, 8) int32 by depth: half-edges h, g,
+cut, side of the cut, row b (-1: as it lies), its strip, place of u, new end w; best (k, 3) int32 the rotations h, g, cut of the best find,
+then its merge."""
 
 
 @njit(cache=True, nogil=True)
@@ -55,7 +56,7 @@ def mirrors():
     return table
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def box_area(boxes, row):
     """Half area of a box."""
     x = boxes[row, 3] + boxes[row, 0]
@@ -64,7 +65,7 @@ def box_area(boxes, row):
     return np.float64(x * y + y * z + z * x)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def join_boxes(boxes, one, other, out, row):
     """Write the box around two to a row of `out`."""
     for q in range(6):
@@ -73,7 +74,7 @@ def join_boxes(boxes, one, other, out, row):
         out[row, q] = a if a > b else b
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def row_cost(rows, begin, length, boxes, mirror, room):
     """Areas of the inner nodes of the balanced tree over a row, and TOP_WEIGHT times that of its root.
 
@@ -108,7 +109,7 @@ def row_cost(rows, begin, length, boxes, mirror, room):
     return total + TOP_WEIGHT * box_area(room, 0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def relabel(rows, begin, first, length, strip, where):
     """Tell the faces of a row from place `first` on which strip they are in, and where."""
     for place in range(first, length):
@@ -117,189 +118,320 @@ def relabel(rows, begin, first, length, strip, where):
         where[face, 1] = place
 
 
-@njit(cache=True, nogil=True)
-def reverse(strips, a, top):
-    """Turn the row of strip a round in the arena's top; returns the new top."""
-    rows = strips.rows
-    begin = strips.begin[a]
-    length = strips.length[a]
-    for i in range(length):
-        rows[top + i] = rows[begin + length - 1 - i]
-    strips.begin[a] = top
-    relabel(rows, top, 0, length, a, strips.where)
-    return top + length
+@njit(cache=True, nogil=True, _nrt=False)
+def append_places(pieces, begin, count, first, last, top):
+    """Write the pieces of the places first:last of a virtual row to the top; returns the new top."""
+    place = 0
+    for k in range(begin, begin + count):
+        one = pieces[k, 0]
+        step = 1 if pieces[k, 1] >= one else -1
+        faces = (pieces[k, 1] - one) * step + 1
+        low = max(first - place, 0)
+        high = min(last - place, faces)
+        if low < high:
+            pieces[top, 0] = one + step * low
+            pieces[top, 1] = one + step * (high - 1)
+            top += 1
+        place += faces
+    return top
 
 
-@njit(cache=True, nogil=True)
-def rotate(strips, path, saved, d, a, h, g, cut, top):
-    """Do a rotation of strip a's end and note at path[d] how to undo it; returns the new top."""
-    rows, begins, lengths, cost, where, mate = (
-        strips.rows, strips.begin, strips.length, strips.cost, strips.where, strips.mate,
-    )  # fmt: skip
-    u = g // 3
-    b = where[u, 0]
-    p = where[u, 1]
+@njit(cache=True, nogil=True, _nrt=False)
+def turn_pieces(pieces, begin, end):
+    """Turn a virtual row round."""
+    while begin < end:
+        end -= 1
+        one = pieces[begin, 0]
+        other = pieces[begin, 1]
+        pieces[begin, 0] = pieces[end, 1]
+        pieces[begin, 1] = pieces[end, 0]
+        pieces[end, 0] = other
+        pieces[end, 1] = one
+        begin += 1
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def take_up(strips, search, used, s, top):
+    """Make strip s, as it lies in the arena, the virtual row `used`; returns the new top of the pieces."""
+    shape = search.shape
+    shape[used, 0] = s
+    shape[used, 1] = top
+    shape[used, 2] = 1
+    shape[used, 3] = strips.length[s]
+    search.pieces[top, 0] = strips.begin[s]
+    search.pieces[top, 1] = strips.begin[s] + strips.length[s] - 1
+    search.cost[used] = strips.kept[s]
+    return top + 1
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def locate(strips, search, used, face):
+    """The virtual row that holds a face, -1 where its strip is as it lies in the arena, and the place there."""
+    where, shape, pieces = strips.where, search.shape, search.pieces
+    s = where[face, 0]
+    place = np.int64(where[face, 1])
+    found = -1
+    known = False
+    for slot in range(used):
+        known = known or shape[slot, 0] == s
+    # Look for its place in the arena among the pieces.
+    if known:
+        x = strips.begin[s] + place
+        for slot in range(used):
+            before = 0
+            begin = shape[slot, 1]
+            for k in range(begin, begin + shape[slot, 2]):
+                one = pieces[k, 0]
+                other = pieces[k, 1]
+                if one <= x <= other or other <= x <= one:
+                    found = slot
+                    place = before + abs(x - one)
+                before += abs(other - one) + 1
+    return found, place
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def face_at(rows, search, slot, place):
+    """The face at a place of a virtual row."""
+    begin = search.shape[slot, 1]
+    face = -1
+    for k in range(begin, begin + search.shape[slot, 2]):
+        one = search.pieces[k, 0]
+        other = search.pieces[k, 1]
+        faces = abs(other - one) + 1
+        if 0 <= place < faces:
+            face = rows[one + place] if other >= one else rows[one - place]
+        place -= faces
+    return face
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def write_row(rows, search, slot, backwards, out, k):
+    """Write the faces of a virtual row, or those from its end to its head, to out from k on; returns the end."""
+    begin = search.shape[slot, 1]
+    count = search.shape[slot, 2]
+    for i in range(count):
+        if backwards:
+            other = search.pieces[begin + count - 1 - i, 0]
+            one = search.pieces[begin + count - 1 - i, 1]
+        else:
+            one = search.pieces[begin + i, 0]
+            other = search.pieces[begin + i, 1]
+        step = 1 if other >= one else -1
+        for x in range(abs(other - one) + 1):
+            out[k] = rows[one + step * x]
+            k += 1
+    return k
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
+    """Do a rotation of virtual row a's end into place p of b, and note at path[d] how to undo it.
+
+    Side 0 cuts b before p, side 1 behind p. Returns the new top of the pieces.
+    """
+    path, shape, cost, pieces = search.path, search.shape, search.cost, search.pieces
+    mate = strips.mate
     back = mate[cut]
-    q = where[back // 3, 1]
-    begin = begins[a]
-    length = lengths[a]
-    # Note the strips as they are, and change the links.
+    # Note the rows as they are, and change the links.
     path[d, 0] = h
     path[d, 1] = g
     path[d, 2] = cut
     path[d, 3] = back
     path[d, 4] = a
-    path[d, 5] = begin
-    path[d, 6] = length
-    path[d, 7] = b
-    path[d, 8] = begins[b]
-    path[d, 9] = lengths[b]
-    saved[d, 0] = cost[a]
-    saved[d, 1] = cost[b]
+    path[d, 5] = b
+    path[d, 6] = used
+    for k in range(3):
+        path[d, 7 + k] = shape[a, 1 + k]
+        path[d, 10 + k] = shape[b, 1 + k]
+    search.saved[d, 0] = cost[a]
+    search.saved[d, 1] = cost[b]
     mate[cut] = -1
     mate[back] = -1
     mate[h] = g
     mate[g] = h
-    # Write strip a's row anew: what stays in place, then the part beyond the link.
-    k = top
-    if a == b:
-        for i in range(p + 1):
-            rows[k] = rows[begin + i]
-            k += 1
-        for i in range(length - 1, p, -1):
-            rows[k] = rows[begin + i]
-            k += 1
-        begins[a] = top
-        cost[a] = -1.0
-        relabel(rows, top, p + 1, length, a, where)
-        return k
-    for i in range(length):
-        rows[k] = rows[begin + i]
-        k += 1
-    other = begins[b]
-    rest = lengths[b]
-    if q < p:
-        for i in range(p, rest):
-            rows[k] = rows[other + i]
-            k += 1
-    else:
-        for i in range(p, -1, -1):
-            rows[k] = rows[other + i]
-            k += 1
-    begins[a] = top
-    lengths[a] = k - top
-    relabel(rows, top, length, k - top, a, where)
-    # Leave strip b the rest, its new end last.
-    if q < p:
-        lengths[b] = p
-    else:
-        begins[b] = k
-        lengths[b] = rest - 1 - p
-        for i in range(rest - 1, p, -1):
-            rows[k] = rows[other + i]
-            k += 1
-        relabel(rows, begins[b], 0, lengths[b], b, where)
+    begin = shape[a, 1]
+    length = shape[a, 3]
     cost[a] = -1.0
     cost[b] = -1.0
-    return k
+    shape[a, 1] = top
+    # Within one strip, turn round what is behind the link.
+    if a == b:
+        middle = append_places(pieces, begin, shape[a, 2], 0, p + 1, top)
+        end = append_places(pieces, begin, shape[a, 2], p + 1, length, middle)
+        turn_pieces(pieces, middle, end)
+        shape[a, 2] = end - top
+    else:
+        # Append the part beyond the link to row a.
+        other = shape[b, 1]
+        count = shape[b, 2]
+        rest = shape[b, 3]
+        low = p if side == 0 else 0
+        high = rest if side == 0 else p + 1
+        middle = append_places(pieces, begin, shape[a, 2], 0, length, top)
+        end = append_places(pieces, other, count, low, high, middle)
+        if side == 1:
+            turn_pieces(pieces, middle, end)
+        shape[a, 2] = end - top
+        shape[a, 3] = length + high - low
+        # Leave row b the rest, its new end last.
+        top = end
+        low = 0 if side == 0 else p + 1
+        high = p if side == 0 else rest
+        end = append_places(pieces, other, count, low, high, top)
+        if side == 1:
+            turn_pieces(pieces, top, end)
+        shape[b, 1] = top
+        shape[b, 2] = end - top
+        shape[b, 3] = high - low
+    return end
 
 
-@njit(cache=True, nogil=True)
-def undo(strips, path, saved, d):
-    """Undo the rotation of path[d]; returns the top as it was before."""
-    top = strips.begin[path[d, 4]]
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def undo(strips, search, d):
+    """Undo the rotation of path[d]; returns how many virtual rows there were before."""
+    path, shape = search.path, search.shape
     mate = strips.mate
     mate[path[d, 0]] = -1
     mate[path[d, 1]] = -1
     mate[path[d, 2]] = path[d, 3]
     mate[path[d, 3]] = path[d, 2]
-    # Point at the old rows, and let the faces that moved know.
-    for k in range(2):
-        s = path[d, 4 + 3 * k]
-        strips.begin[s] = path[d, 5 + 3 * k]
-        strips.length[s] = path[d, 6 + 3 * k]
-        strips.cost[s] = saved[d, k]
-    b = path[d, 7]
-    relabel(strips.rows, strips.begin[b], 0, strips.length[b], b, strips.where)
-    return top
+    a = path[d, 4]
+    b = path[d, 5]
+    for k in range(3):
+        shape[a, 1 + k] = path[d, 7 + k]
+        shape[b, 1 + k] = path[d, 10 + k]
+    search.cost[a] = search.saved[d, 0]
+    search.cost[b] = search.saved[d, 1]
+    return path[d, 6]
 
 
-@njit(cache=True, nogil=True)
-def known_cost(strips, ground, s):
-    """The cost of strip s's row, worked out where it is not known."""
-    if strips.cost[s] < 0.0:
-        strips.cost[s] = row_cost(
-            strips.rows, strips.begin[s], strips.length[s], ground.boxes, ground.mirror, ground.room
-        )
-    return strips.cost[s]
-
-
-@njit(cache=True, nogil=True)
-def change_of(strips, ground, touched, count, skip, other):
-    """By how much the strips touched[:count], each once, have become dearer; two of them count as gone."""
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def change_of(strips, ground, search, used, skip, other):
+    """By how much the virtual rows, but for two that count as gone, are dearer than the strips they stand for."""
     change = 0.0
-    for i in range(count):
-        s = touched[i]
-        again = False
-        for j in range(i):
-            again = again or touched[j] == s
-        if again:
-            continue
-        change -= strips.kept[s]
-        if s != skip and s != other:
-            change += known_cost(strips, ground, s)
+    for slot in range(used):
+        change -= strips.kept[search.shape[slot, 0]]
+        if slot != skip and slot != other:
+            # Work the cost out where it is not known.
+            if search.cost[slot] < 0.0:
+                length = write_row(strips.rows, search, slot, False, ground.line, 0)
+                search.cost[slot] = row_cost(ground.line, 0, length, ground.boxes, ground.mirror, ground.room)
+            change += search.cost[slot]
     return change
 
 
-@njit(cache=True, nogil=True)
-def append_row(strips, a, c, head_first, top):
-    """Write strip a's row and behind it strip c's, from its head or end, to the top; returns the length."""
-    rows = strips.rows
-    k = top
-    begin = strips.begin[a]
-    for i in range(strips.length[a]):
-        rows[k] = rows[begin + i]
-        k += 1
-    begin = strips.begin[c]
-    length = strips.length[c]
-    if head_first:
-        for i in range(length):
-            rows[k] = rows[begin + i]
-            k += 1
-    else:
-        for i in range(length - 1, -1, -1):
-            rows[k] = rows[begin + i]
-            k += 1
-    return k - top
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def is_end(mate, face):
+    """Whether a face has fewer than two links, and so stands at an end of its row."""
+    free = 0
+    for h in range(3 * face, 3 * face + 3):
+        free += 1 if mate[h] < 0 else 0
+    return free > 1
 
 
-@njit(cache=True, nogil=True)
-def may_merge(strips, ground, w, freed, t, b, rest, most):
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def may_merge(strips, ground, search, used, w, freed, t, b, rest, most):
     """Whether w, an end of strip b of `rest` faces once its link by `freed` is cut, may find a partner."""
+    found = False
     for slot in range(3):
         h = 3 * w + slot
-        if strips.mate[h] >= 0 or h == freed:
-            continue
-        g = ground.ring[h]
-        while g != h:
+        g = h
+        if strips.mate[h] < 0 and h != freed:
+            g = ground.ring[h]
+        while g != h and not found:
             v = g // 3
-            if strips.mate[g] < 0 and v != w and v != t:
-                c = strips.where[v, 0]
-                place = strips.where[v, 1]
-                length = strips.length[c]
-                if (
-                    (place == 0 or place == length - 1)
-                    and (c == b or length + rest <= most)
-                    and ground.faces[v, g % 3] != ground.faces[w, slot]
-                ):
-                    return True
+            if (
+                strips.mate[g] < 0
+                and v != w
+                and v != t
+                and is_end(strips.mate, v)
+                and ground.faces[v, g % 3] != ground.faces[w, slot]
+            ):
+                c, _ = locate(strips, search, used, v)
+                s = search.shape[c, 0] if c >= 0 else strips.where[v, 0]
+                length = search.shape[c, 3] if c >= 0 else strips.length[s]
+                found = s == b or length + rest <= most
             g = ground.ring[g]
-    return False
+    return found
 
 
-@njit(cache=True, nogil=True)
-def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowance, most, top):
-    """Look from the end of strip `start` for the best chain of exactly so many rotations, then a merge.
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def list_moves(strips, ground, search, used, d, rotations, neutral, most):
+    """List in moves[d] the rotations that the end at depth d may do; returns how many, MOST_ROTATIONS at most.
+
+    The last one before a merge is listed only where a merge may follow, unless it may do without (neutral).
+    """
+    path, shape, moves = search.path, search.shape, search.moves
+    rows, mate, ring, faces = strips.rows, strips.mate, ground.ring, ground.faces
+    count = 0
+    a = search.level[d, 2]
+    t = search.level[d, 3]
+    for slot in range(3):
+        h = 3 * t + slot
+        g = ring[h] if mate[h] < 0 else h
+        while g != h:
+            u = g // 3
+            inner = mate[g] < 0 and u != t and not is_end(mate, u) and faces[u, g % 3] != faces[t, slot]
+            b = -1
+            p = 0
+            s = 0
+            length = 0
+            if inner:
+                b, p = locate(strips, search, used, u)
+                s = shape[b, 0] if b >= 0 else strips.where[u, 0]
+                length = shape[b, 3] if b >= 0 else strips.length[s]
+                inner = length <= LONGEST
+            # Cut u's link towards the head (side 0) or the end (side 1); see that the lengths are right.
+            for side in range(2 if inner else 0):
+                if a == b:
+                    refused = side == 0 or p + 1 == length - 1
+                    rest = length
+                elif side == 0:
+                    refused = shape[a, 3] + length - p > most
+                    rest = p
+                else:
+                    refused = shape[a, 3] + p + 1 > most
+                    rest = length - 1 - p
+                if refused or count == MOST_ROTATIONS:
+                    continue
+                place = p - 1 + 2 * side
+                w = face_at(rows, search, b, place) if b >= 0 else rows[strips.begin[s] + place]
+                cut = 3 * u
+                while mate[cut] < 0 or mate[cut] // 3 != w:
+                    cut += 1
+                # Never cut a link that this chain has made, nor go where no merge can follow.
+                for i in range(d):
+                    refused = refused or path[i, 0] == cut or path[i, 1] == cut
+                if not refused and d == rotations - 1 and rotations > neutral:
+                    refused = not may_merge(strips, ground, search, used, w, mate[cut], t, s, rest, most)
+                if not refused:
+                    moves[d, count, 0] = h
+                    moves[d, count, 1] = g
+                    moves[d, count, 2] = cut
+                    moves[d, count, 3] = side
+                    moves[d, count, 4] = b
+                    moves[d, count, 5] = s
+                    moves[d, count, 6] = p
+                    moves[d, count, 7] = w
+                    count += 1
+            g = ring[g]
+    return count
+
+
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+def keep_best(search, d, h, g):
+    """Write the rotations done so far, and the merge by half-edges h and g behind them, to search.best."""
+    for i in range(d):
+        for k in range(3):
+            search.best[i, k] = search.path[i, k]
+    search.best[d, 0] = h
+    search.best[d, 1] = g
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, most):
+    """Look from the end of virtual row 0 for the best chain of exactly so many rotations, then a merge.
 
     A chain is worth `price` where it ends in a merge, less what it makes the strips dearer, which is at most
     `allowance`; with `neutral` chains without a merge count too. Writes the best chain that is worth more
@@ -308,163 +440,151 @@ def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowa
     Returns:
         Whether there is one, and how much dearer it makes the strips.
     """
-    level, path, saved, touched, best = search
-    rows, begins, lengths, where, mate = (
-        strips.rows, strips.begin, strips.length, strips.where, strips.mate,
-    )  # fmt: skip
-    ring = ground.ring
-    faces = ground.faces
+    level, path, shape, moves = search.level, search.path, search.shape, search.moves
+    rows, mate, ring, faces = strips.rows, strips.mate, ground.ring, ground.faces
     found = False
     found_change = 0.0
     # A change that rounding could explain is worth nothing.
-    best_worth = 1e-6 * strips.kept[start]
+    best_worth = 1e-6 * strips.kept[shape[0, 0]]
     done = 0
+    used = 1
+    top = 1
     d = 0
-    touched[0] = start
-    level[0, 0] = start
-    level[0, 1] = 0
-    level[0, 2] = -1
+    level[0, 2] = 0
+    level[0, 3] = face_at(rows, search, 0, shape[0, 3] - 1)
+    arrived = True
     while True:
-        a = level[d, 0]
-        slot = level[d, 1]
-        # Step back where all edges of this end have been tried.
-        if slot == 3:
+        if arrived and d < rotations:
+            level[d, 0] = 0
+            level[d, 1] = list_moves(strips, ground, search, used, d, rotations, neutral, most)
+        elif arrived:
+            # See what the rotations are worth without a merge.
+            a = level[d, 2]
+            t = level[d, 3]
+            if 0 < d <= neutral:
+                change = change_of(strips, ground, search, used, -1, -1)
+                if -change > best_worth:
+                    best_worth = -change
+                    found = True
+                    found_change = change
+                    keep_best(search, d, -1, -1)
+            # Merge with each strip that ends beside this end, and see what that is worth.
+            for slot in range(3):
+                h = 3 * t + slot
+                g = ring[h] if mate[h] < 0 else h
+                while g != h:
+                    u = g // 3
+                    if mate[g] < 0 and u != t and is_end(mate, u) and faces[u, g % 3] != faces[t, slot]:
+                        b, p = locate(strips, search, used, u)
+                        s = shape[b, 0] if b >= 0 else strips.where[u, 0]
+                        length = shape[b, 3] if b >= 0 else strips.length[s]
+                        if a != b and shape[a, 3] + length <= most:
+                            with_b = used
+                            if b < 0:
+                                b = used
+                                with_b = used + 1
+                                take_up(strips, search, b, s, top)
+                            change = change_of(strips, ground, search, with_b, a, b)
+                            if price - change > best_worth and change <= allowance:
+                                k = write_row(rows, search, a, False, ground.line, 0)
+                                k = write_row(rows, search, b, p > 0, ground.line, k)
+                                change += row_cost(ground.line, 0, k, ground.boxes, ground.mirror, ground.room)
+                            if price - change > best_worth and change <= allowance:
+                                best_worth = price - change
+                                found = True
+                                found_change = change
+                                keep_best(search, d, h, g)
+                    g = ring[g]
+        # Step back where all has been tried.
+        if d == rotations or level[d, 0] == level[d, 1] or done == MOST_ROTATIONS:
             if d == 0:
-                return found, found_change
+                break
             d -= 1
-            top = undo(strips, path, saved, d)
-            level[d, 3] += 1
+            top = path[d, 13]
+            used = undo(strips, search, d)
+            arrived = False
             continue
-        # Find the next half-edge to go through.
-        t = rows[begins[a] + lengths[a] - 1]
-        h = 3 * t + slot
-        g = level[d, 2]
-        if g < 0:
-            if mate[h] >= 0:
-                level[d, 1] += 1
-                continue
-            g = ring[h]
-            level[d, 2] = g
-            level[d, 3] = 0
-        if g == h:
-            level[d, 1] += 1
-            level[d, 2] = -1
-            continue
-        side = level[d, 3]
-        u = g // 3
-        if side > 1 or mate[g] >= 0 or u == t or faces[u, g % 3] == faces[t, slot]:
-            level[d, 2] = ring[g]
-            level[d, 3] = 0
-            continue
-        b = where[u, 0]
-        p = where[u, 1]
-        length = lengths[b]
-        if p == 0 or p == length - 1:
-            # Merge with the strip that ends here, and see what that is worth.
-            level[d, 3] = 2
-            if d == rotations and a != b and lengths[a] + length <= most:
-                touched[d + 1] = b
-                change = change_of(strips, ground, touched, d + 2, a, b)
-                if price - change > best_worth and change <= allowance:
-                    total = append_row(strips, a, b, p == 0, top)
-                    change += row_cost(rows, top, total, ground.boxes, ground.mirror, ground.room)
-                    if price - change > best_worth and change <= allowance:
-                        best_worth = price - change
-                        found = True
-                        found_change = change
-                        for i in range(d):
-                            for k in range(3):
-                                best[i, k] = path[i, k]
-                        best[d, 0] = h
-                        best[d, 1] = g
-            continue
-        if d == rotations or length > LONGEST:
-            level[d, 3] = 2
-            continue
-        # Cut u's link towards the head (side 0) or towards the end (side 1); see that the lengths are right.
-        if a == b:
-            refused = side == 0 or p + 1 == length - 1
-            rest = length
-        elif side == 0:
-            refused = lengths[a] + length - p > most
-            rest = p
-        else:
-            refused = lengths[a] + p + 1 > most
-            rest = length - 1 - p
-        if refused or done >= MOST_ROTATIONS:
-            level[d, 3] += 1
-            continue
-        w = rows[begins[b] + p - 1 + 2 * side]
-        cut = 3 * u
-        while mate[cut] < 0 or mate[cut] // 3 != w:
-            cut += 1
-        # Never cut a link that this chain has made, nor go where no merge can follow.
-        for i in range(d):
-            refused = refused or path[i, 0] == cut or path[i, 1] == cut
-        if not refused and d == rotations - 1 and rotations > neutral:
-            refused = not may_merge(strips, ground, w, mate[cut], t, b, rest, most)
-        if refused:
-            level[d, 3] += 1
-            continue
-        top = rotate(strips, path, saved, d, a, h, g, cut, top)
+        # Do the next rotation.
+        k = level[d, 0]
+        level[d, 0] = k + 1
+        b = moves[d, k, 4]
+        path[d, 13] = top
+        before = used
+        if b < 0:
+            b = used
+            used += 1
+            top = take_up(strips, search, b, moves[d, k, 5], top)
+        h, g, cut, side, p = moves[d, k, 0], moves[d, k, 1], moves[d, k, 2], moves[d, k, 3], moves[d, k, 6]
+        top = rotate(strips, search, d, before, level[d, 2], b, p, side, h, g, cut, top)
         done += 1
         d += 1
-        touched[d] = b
-        level[d, 0] = b
-        level[d, 1] = 0
-        level[d, 2] = -1
-        # See what the rotations are worth without a merge.
-        if d == rotations and rotations <= neutral:
-            change = change_of(strips, ground, touched, d + 1, -1, -1)
-            if -change > best_worth:
-                best_worth = -change
-                found = True
-                found_change = change
-                for i in range(d):
-                    for k in range(3):
-                        best[i, k] = path[i, k]
-                best[d, 0] = -1
+        level[d, 2] = b
+        level[d, 3] = moves[d - 1, k, 7]
+        arrived = True
+    return found, found_change
 
 
-@njit(cache=True, nogil=True)
-def accept(strips, ground, search, start, rotations, now, top):
-    """Do the best chain that find_tunnel left, for good; returns the new top."""
-    touched = search.touched
-    best = search.best
-    a = start
-    touched[0] = a
-    count = 1
+@njit(cache=True, nogil=True, _nrt=False)
+def accept(strips, ground, search, rotations, now, top):
+    """Do the best chain that find_tunnel left, for good; returns the new top of the arena."""
+    best, shape = search.best, search.shape
+    rows = strips.rows
+    used = 1
+    a = 0
+    end = 1
     for d in range(rotations):
-        b = strips.where[best[d, 1] // 3, 0]
-        top = rotate(strips, search.path, search.saved, d, a, best[d, 0], best[d, 1], best[d, 2], top)
+        u = best[d, 1] // 3
+        b, p = locate(strips, search, used, u)
+        with_b = used
+        if b < 0:
+            b = used
+            with_b = used + 1
+            end = take_up(strips, search, used, strips.where[u, 0], end)
+        cut = best[d, 2]
+        _, q = locate(strips, search, with_b, strips.mate[cut] // 3)
+        side = 0 if q < p else 1
+        end = rotate(strips, search, d, used, a, b, p, side, best[d, 0], best[d, 1], cut, end)
+        used = with_b
         a = b
-        touched[count] = b
-        count += 1
     # Append the other strip to the last end's.
-    if best[rotations, 0] >= 0:
-        h = best[rotations, 0]
+    gone = -1
+    h = best[rotations, 0]
+    if h >= 0:
         g = best[rotations, 1]
-        c = strips.where[g // 3, 0]
-        length = append_row(strips, a, c, strips.where[g // 3, 1] == 0, top)
+        gone, p = locate(strips, search, used, g // 3)
+        if gone < 0:
+            gone = used
+            end = take_up(strips, search, used, strips.where[g // 3, 0], end)
+            used += 1
         strips.mate[h] = g
         strips.mate[g] = h
-        strips.length[c] = 0
-        strips.kept[c] = 0.0
-        strips.begin[a] = top
-        relabel(strips.rows, top, strips.length[a], length, a, strips.where)
-        strips.length[a] = length
-        strips.cost[a] = -1.0
-        top += length
-    # Keep the costs.
-    for i in range(count):
-        s = touched[i]
-        if strips.length[s] > 0:
-            strips.kept[s] = known_cost(strips, ground, s)
-            strips.changed[s] = now
+        search.cost[a] = -1.0
+    # Write the rows to the arena, and keep their costs.
+    for slot in range(used):
+        if slot != gone:
+            k = write_row(rows, search, slot, False, rows, top)
+            if slot == a and gone >= 0:
+                k = write_row(rows, search, gone, p > 0, rows, k)
+            shape[slot, 1] = top
+            shape[slot, 3] = k - top
+            top = k
+    for slot in range(used):
+        s = shape[slot, 0]
+        if slot == gone:
+            strips.length[s] = 0
+            strips.kept[s] = 0.0
+            continue
+        begin = shape[slot, 1]
+        length = shape[slot, 3]
+        strips.begin[s] = begin
+        strips.length[s] = length
+        relabel(rows, begin, 0, length, s, strips.where)
+        strips.kept[s] = row_cost(rows, begin, length, ground.boxes, ground.mirror, ground.room)
+        strips.changed[s] = now
     return top
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def compact(strips, spare):
     """Move the rows of the strips that are left to the arena's bottom, in order; returns the top."""
     k = 0
@@ -474,7 +594,8 @@ def compact(strips, spare):
         for i in range(strips.length[s]):
             spare[k] = strips.rows[begin + i]
             k += 1
-    strips.rows[:k] = spare[:k]
+    for i in range(k):
+        strips.rows[i] = spare[i]
     return k
 
 
@@ -494,7 +615,7 @@ def by_length(length, order, longest):
     return first[longest]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def changed_near(strips, ring, s, since):
     """Whether strip s, or one that its ends might go into, has been changed after a time."""
     if strips.changed[s] > since:
@@ -532,25 +653,30 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
     count = strips.begin.shape[0]
     faces = ground.faces.shape[0]
     longest = min(most, LONGEST)
+    depths = deepest + 2
     search = Search(
-        np.empty((deepest + 2, 4), np.int32),
-        np.empty((deepest + 2, 10), np.int32),
-        np.empty((deepest + 2, 2), np.float64),
-        np.empty(deepest + 3, np.int32),
-        np.empty((deepest + 2, 3), np.int32),
+        np.empty((depths, 4), np.int32),
+        np.empty((depths, 14), np.int32),
+        np.empty((depths, 2), np.float64),
+        np.empty((depths + 1, 4), np.int32),
+        np.empty(depths + 1, np.float64),
+        np.empty((2 * depths * (depths + 2), 2), np.int32),
+        np.empty((depths, MOST_ROTATIONS, 8), np.int32),
+        np.empty((depths, 3), np.int32),
     )
     spare = np.empty(faces, np.int32)
     order = np.empty(count, np.int32)
     tried = np.full(count, -1, np.int32)
     # Cost the strips as they are.
-    strips.cost[:] = -1.0
     strips.changed[:] = 0
     start_cost = leaves
     searched = 0
     for s in range(count):
         strips.kept[s] = 0.0
         if strips.length[s] <= LONGEST:
-            strips.kept[s] = known_cost(strips, ground, s)
+            strips.kept[s] = row_cost(
+                strips.rows, strips.begin[s], strips.length[s], ground.boxes, ground.mirror, ground.room
+            )
             start_cost += strips.kept[s]
             searched += 1
     if searched == 0:
@@ -574,28 +700,20 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
                     break
                 if top + room > strips.rows.shape[0]:
                     top = compact(strips, spare)
-                # Turn the head to the back, so that the search goes out from it.
-                begin = strips.begin[s]
-                before = top
-                if side == 0:
-                    top = reverse(strips, s, top)
-                    strips.cost[s] = -1.0
-                found = False
                 for rotations in range(deepest + 1):
+                    # Go out from the end, or turned round from the head.
+                    take_up(strips, search, 0, s, 0)
+                    if side == 0:
+                        turn_pieces(search.pieces, 0, 1)
                     found, change = find_tunnel(
-                        strips, ground, search, s, rotations, neutral, price, most_cost - cost, longest, top
+                        strips, ground, search, rotations, neutral, price, most_cost - cost, longest
                     )
                     if found:
                         now += 1
-                        top = accept(strips, ground, search, s, rotations, now, top)
+                        top = accept(strips, ground, search, rotations, now, top)
                         cost += change
                         accepted += 1
                         break
-                if not found and side == 0:
-                    top = before
-                    strips.begin[s] = begin
-                    strips.cost[s] = strips.kept[s]
-                    relabel(strips.rows, begin, 0, strips.length[s], s, strips.where)
         if accepted == 0:
             break
     return start_cost, cost
