@@ -18,6 +18,7 @@ from striptools.kernels.strip_tunnels import (
     Strips,
     box_area,
     mirrors,
+    room_for_search,
     row_cost,
     search_range,
 )
@@ -98,7 +99,8 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
             strips.where[rows[strips.begin[s] + place], 0] = s
             strips.where[rows[strips.begin[s] + place], 1] = place
     ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32), np.empty(LONGEST, np.int32))
-    before, after = search_range(strips, ground, most, deepest, neutral, price, rise, passes, leaves)
+    search = room_for_search(deepest, count, strip_count)
+    before, after = search_range(strips, ground, search, most, deepest, neutral, price, rise, passes, leaves)
     # Write the strips by the place of their first faces, each turned the cheaper way.
     k = 0
     written = 0

@@ -33,13 +33,33 @@ Strips = namedtuple("Strips", "rows begin length kept changed where mate")
 its cost, and changed (s,) int32, when it was changed last; where (n, 2) int32, strip and place of each face;
 mate (3n,) int32, the linked half-edge or -1."""
 
-Search = namedtuple("Search", "level path saved shape cost pieces moves best")
+Search = namedtuple("Search", "level path saved shape cost pieces moves best spare order tried first")
 """Working room of one search: level (k, 4) int32 by depth: next move, how many, virtual row, its end face; path (k, 14) int32, the rotations done: half-edges h, g, cut, its mate, rows a and b, how many
 rows there were, begin, count, length of a and of b, the top of the pieces; saved (k, 2) float64 their costs; shape (k, 4) int32
 by virtual row: strip, begin and count of its pieces, length; cost (k,) float64 (negative: not known); pieces
 (p, 2) int32: first and last place in the arena; moves (k, MOST_ROTATIONS, 8) int32 by depth: half-edges h, g,
 cut, side of the cut, row b (-1: as it lies), its strip, place of u, new end w; best (k, 3) int32 the rotations h, g, cut of the best find,
-then its merge."""
+then its merge. For the passes: spare (n,) int32, order and tried (s,) int32, first (LONGEST + 2,) int32."""
+
+
+@njit(cache=True, nogil=True)
+def room_for_search(deepest, faces, strips):
+    """Room for a search of so many rotations over so many faces in so many strips."""
+    depths = deepest + 2
+    return Search(
+        np.empty((depths, 4), np.int32),
+        np.empty((depths, 14), np.int32),
+        np.empty((depths, 2), np.float64),
+        np.empty((depths + 1, 4), np.int32),
+        np.empty(depths + 1, np.float64),
+        np.empty((2 * depths * (depths + 2), 2), np.int32),
+        np.empty((depths, MOST_ROTATIONS, 8), np.int32),
+        np.empty((depths, 3), np.int32),
+        np.empty(faces, np.int32),
+        np.empty(strips, np.int32),
+        np.empty(strips, np.int32),
+        np.empty(LONGEST + 2, np.int32),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -429,7 +449,7 @@ def keep_best(search, d, h, g):
     search.best[d, 1] = g
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, most):
     """Look from the end of virtual row 0 for the best chain of exactly so many rotations, then a merge.
 
@@ -524,7 +544,7 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
     return found, found_change
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def accept(strips, ground, search, rotations, now, top):
     """Do the best chain that find_tunnel left, for good; returns the new top of the arena."""
     best, shape = search.best, search.shape
@@ -599,10 +619,14 @@ def compact(strips, spare):
     return k
 
 
-@njit(cache=True, nogil=True)
-def by_length(length, order, longest):
-    """List the strips of up to `longest` faces in `order`, the shortest first, equals by number."""
-    first = np.zeros(longest + 2, np.int32)
+@njit(cache=True, nogil=True, _nrt=False)
+def by_length(length, order, longest, first):
+    """List the strips of up to `longest` faces in `order`, the shortest first, equals by number.
+
+    Returns how many there are; first (longest + 2,) is room.
+    """
+    for k in range(longest + 2):
+        first[k] = 0
     for s in range(length.shape[0]):
         if 0 < length[s] <= longest:
             first[length[s] + 1] += 1
@@ -615,7 +639,7 @@ def by_length(length, order, longest):
     return first[longest]
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def changed_near(strips, ring, s, since):
     """Whether strip s, or one that its ends might go into, has been changed after a time."""
     if strips.changed[s] > since:
@@ -632,13 +656,14 @@ def changed_near(strips, ring, s, since):
     return False
 
 
-@njit(cache=True, nogil=True)
-def search_range(strips, ground, most, deepest, neutral, price_share, rise, passes, leaves):
+@njit(cache=True, nogil=True, _nrt=False)
+def search_range(strips, ground, search, most, deepest, neutral, price_share, rise, passes, leaves):
     """Improve the strips of a range in passes over them, the shortest first, from both ends.
 
     Args:
         strips: Their rows at the arena's bottom; cost, kept and changed are set here.
         ground: The range.
+        search: Room, as `room_for_search` makes it.
         most: The most faces of a strip.
         deepest: The most rotations of a chain.
         neutral: The most rotations of a chain without a merge.
@@ -653,26 +678,13 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
     count = strips.begin.shape[0]
     faces = ground.faces.shape[0]
     longest = min(most, LONGEST)
-    depths = deepest + 2
-    search = Search(
-        np.empty((depths, 4), np.int32),
-        np.empty((depths, 14), np.int32),
-        np.empty((depths, 2), np.float64),
-        np.empty((depths + 1, 4), np.int32),
-        np.empty(depths + 1, np.float64),
-        np.empty((2 * depths * (depths + 2), 2), np.int32),
-        np.empty((depths, MOST_ROTATIONS, 8), np.int32),
-        np.empty((depths, 3), np.int32),
-    )
-    spare = np.empty(faces, np.int32)
-    order = np.empty(count, np.int32)
-    tried = np.full(count, -1, np.int32)
     # Cost the strips as they are.
-    strips.changed[:] = 0
     start_cost = leaves
     searched = 0
     for s in range(count):
         strips.kept[s] = 0.0
+        strips.changed[s] = 0
+        search.tried[s] = -1
         if strips.length[s] <= LONGEST:
             strips.kept[s] = row_cost(
                 strips.rows, strips.begin[s], strips.length[s], ground.boxes, ground.mirror, ground.room
@@ -689,17 +701,17 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
     now = 0
     for _ in range(passes):
         accepted = 0
-        waiting = by_length(strips.length, order, longest)
+        waiting = by_length(strips.length, search.order, longest, search.first)
         for k in range(waiting):
-            s = order[k]
-            if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, tried[s]):
+            s = search.order[k]
+            if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, search.tried[s]):
                 continue
-            tried[s] = now
+            search.tried[s] = now
             for side in range(2):
                 if strips.length[s] == 0 or (side == 1 and strips.length[s] == 1):
                     break
                 if top + room > strips.rows.shape[0]:
-                    top = compact(strips, spare)
+                    top = compact(strips, search.spare)
                 for rotations in range(deepest + 1):
                     # Go out from the end, or turned round from the head.
                     take_up(strips, search, 0, s, 0)
