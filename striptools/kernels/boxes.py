@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from striptools.kernels.compiled import kernel
+
 
 @njit(cache=True, nogil=True, forceinline=True)
 def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
@@ -13,7 +15,7 @@ def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
     return x * y + y * z + z * x
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def face_boxes(positions, faces, begin, end, boxes):
     """Fill boxes (n, 6) with the bounds of the three corners of the faces `begin:end`."""
     for face in range(begin, end):
@@ -24,7 +26,7 @@ def face_boxes(positions, faces, begin, end, boxes):
             boxes[face, 3 + axis] = max(max(one, two), three)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def range_boxes(boxes, items, starts, out):
     """Fill out (s, 6) with the box around each range `items[starts[i] : starts[i + 1]]`, none empty."""
     for part in range(starts.shape[0] - 1):
@@ -38,7 +40,7 @@ def range_boxes(boxes, items, starts, out):
                 out[part, 3 + axis] = max(out[part, 3 + axis], boxes[item, 3 + axis])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def node_boxes(order, size, item_boxes, boxes):
     """Fill boxes (2n-1, 6) of a preorder tree from the boxes of its items."""
     # Walk backwards, so that children come before their parents and leaves in falling position.

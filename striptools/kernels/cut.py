@@ -1,9 +1,9 @@
 """Cut an object tree into ranges of leaves: the loop behind partition/cut.py."""
 
-from numba import njit
+from striptools.kernels.compiled import helper, kernel
 
 
-@njit(cache=True, nogil=True)
+@helper
 def meets_few(faces, order, begin, end, seen, stamp, most):
     """Whether the faces order[begin:end] have at most `most` different vertices; marks them with `stamp`."""
     count = 0
@@ -18,7 +18,7 @@ def meets_few(faces, order, begin, end, seen, stamp, most):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
     """Write the first positions of the largest subtrees within both limits; returns how many there are.
 

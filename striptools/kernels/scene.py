@@ -1,7 +1,8 @@
 """Loops over the arrays of a scene: vertices numbered by first use, and the rules that a scene file keeps."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import kernel
 
 KEEPS_RULES = 0
 OUTSIDE = 1
@@ -10,7 +11,7 @@ TOO_EARLY = 2
 """A strip vertex that is new and not the next one."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def renumber_by_first_use(vertices, place, numbered, used):
     """Number vertices in the order of their first use.
 
@@ -34,7 +35,7 @@ def renumber_by_first_use(vertices, place, numbered, used):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather_rows(rows, chosen, begin, end, out):
     """Copy the rows `chosen[begin:end]` of (v, 3) to their places in out."""
     for k in range(begin, end):
@@ -42,14 +43,14 @@ def gather_rows(rows, chosen, begin, end, out):
             out[k, axis] = rows[chosen[k], axis]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather_items(items, chosen, begin, end, out):
     """Copy the items `chosen[begin:end]` to their places in out."""
     for k in range(begin, end):
         out[k] = items[chosen[k]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_vertex_flaw(vertices, vertex_count):
     """A rule that strip vertices break, the first place where they do, and the largest vertex.
 
@@ -67,7 +68,7 @@ def first_vertex_flaw(vertices, vertex_count):
     return (KEEPS_RULES if early < 0 else TOO_EARLY), early, largest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_row_not_finite(rows, begin, end):
     """The first of the rows `begin:end` of (n, 3) with an entry that is not finite, or -1."""
     for k in range(begin, end):
@@ -76,7 +77,7 @@ def first_row_not_finite(rows, begin, end):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_repeated_corner(faces, begin, end):
     """The first of the faces `begin:end` with two corners that are one vertex, or -1."""
     for k in range(begin, end):
@@ -86,7 +87,7 @@ def first_repeated_corner(faces, begin, end):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def strip_boxes(positions, vertices, starts, first, last, boxes):
     """Fill boxes (s, 6) with the bounds of the vertices of the strips `first:last`."""
     for strip in range(first, last):
@@ -105,7 +106,7 @@ def strip_boxes(positions, vertices, starts, first, last, boxes):
         boxes[strip, 2], boxes[strip, 5] = lo_z, hi_z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def has_repeat(items, seen):
     """Whether an item stands twice; every item is a place in seen, all False."""
     for k in range(items.shape[0]):

@@ -5,13 +5,14 @@ half-edge, or -1; `links` (n,) uint8 the links of each face.
 """
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel
 
 CLASSES = 64
 """Two classes an octave of subtree sizes: more than any int32 size needs."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def size_class(count):
     """Which of the classes a subtree of `count` >= 2 items falls in: two an octave."""
     octave = 0
@@ -20,7 +21,7 @@ def size_class(count):
     return 2 * octave + (count >> (octave - 1) & 1)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def common_size(a, b, parent, size):
     """Items below the lowest node that holds both nodes."""
     while not a <= b < a + 2 * size[a] - 1:
@@ -28,7 +29,7 @@ def common_size(a, b, parent, size):
     return size[a]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def link_range(ring, faces, leaf, parent, size, most, mate, links):
     """Link the faces of a range into paths of at most `most` faces, the nearest in the tree first.
 

@@ -5,7 +5,8 @@ Sets of slots are bit masks (bit k for slot k). Slot k of a face is its edge fro
 """
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, inlined, kernel
 
 ALL_SLOTS = 7
 
@@ -34,7 +35,7 @@ USABLE = np.array([_usable_crossings(entered) for entered in range(8)], np.int64
 ENTRIES_BEFORE = np.array([_entries_before(leaving) for leaving in range(8)], np.int64)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def crossings(faces, t, u):
     """The ways from face t to face u, edges run in opposite directions: a set of bits 3 * leave + enter."""
     a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -46,20 +47,20 @@ def crossings(faces, t, u):
     return ways
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def slots_entered(ways):
     """The slots of the second face that a set of crossings enters by."""
     return (ways | ways >> 3 | ways >> 6) & ALL_SLOTS
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def slots_left(ways, entered):
     """The slots of the first face by which a set of crossings comes to slot `entered` of the second."""
     ways >>= entered
     return ways & 1 | ways >> 2 & 2 | ways >> 4 & 4
 
 
-@njit(cache=True, nogil=True)
+@helper
 def slots_after(faces, t, entered, u):
     """The set of slots face u can be entered by from face t, itself entered by one of the set `entered`.
 
@@ -69,7 +70,7 @@ def slots_after(faces, t, entered, u):
     return slots_entered(crossings(faces, t, u) & USABLE[entered])
 
 
-@njit(cache=True, nogil=True)
+@helper
 def longest_strip(starts, first, last):
     """The most faces of the strips `first:last`, at least 1."""
     longest = 1
@@ -78,7 +79,7 @@ def longest_strip(starts, first, last):
     return longest
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def gather_strip(faces, order, begin, end, rows):
     """Copy the faces `order[begin:end]` to rows, where the passes that follow find them in order."""
     for k in range(begin, end):
@@ -86,7 +87,7 @@ def gather_strip(faces, order, begin, end, rows):
             rows[k - begin, corner] = faces[order[k], corner]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def choose_strip(rows, count, ways, entries):
     """Fill entries (count,) with the slot each row is entered by, 3 for the first; ways with all crossings.
 
@@ -112,7 +113,7 @@ def choose_strip(rows, count, ways, entries):
     return broken
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_break(faces, order, starts):
     """The first position of any strip that its predecessor cannot lead to, -1 where all can."""
     longest = longest_strip(starts, 0, starts.shape[0] - 1)
@@ -127,7 +128,7 @@ def first_break(faces, order, starts):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def encode(faces, order, starts, first, last, vertices, turns, rotation):
     """Fill vertices (n + 2s,), turns (n,) and rotation (n,) of the strips `first:last`.
 
@@ -167,7 +168,7 @@ def encode(faces, order, starts, first, last, vertices, turns, rotation):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode(vertices, turns, starts, first, last, faces):
     """Fill faces (n, 3) with the triangles of strips `first:last`."""
     for strip in range(first, last):

@@ -1,7 +1,8 @@
 """Tunnels: chains of rotations that end in a merge, the loops behind strips/tunnelling.py.
 
-Faces of a range are numbered by their place in it. A *strip* is a row of faces, kept in an arena `rows`; new
-rows go to the arena's top, so that a rotation is undone by pointing back at the old row. A strip's *end* is
+Faces of a range are numbered by their place in it. A *strip* is a row of faces, kept in an arena `rows`;
+rows of changed strips go to the arena's top. While a chain is tried nothing is written there: a *virtual row*
+is a list of pieces of the arena, each run forwards or backwards. A strip's *end* is
 the last face of its row, its *head* the first. A *rotation* links the end t of strip a to an inner face u of
 strip b and cuts one of u's links; the part of b on the far side of the cut leaves b for a, and the face w
 at the near side is the new end. Within one strip (a = b) the cut must face t, or a ring would close.
@@ -13,13 +14,20 @@ scaled by a power of two to lie within -1 and 1, so that no area overflows float
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, inlined, kernel, maker, spliced
 
 LONGEST = 256
 """Strips of more faces than this are left alone: an evaluation costs as much as its strips are long."""
 
 MOST_ROTATIONS = 400
 """A search from one end gives up after this many rotations."""
+
+NONE = np.int64(-1)
+ZERO = np.int64(0)
+ONE = np.int64(1)
+FORWARDS = np.bool_(False)
+"""Constants of the types of variables: for a bare 0 Numba compiles once more what takes it."""
 
 TOP_WEIGHT = 4.0
 """What the hierarchy over the strips costs for a strip, in areas of the strip's box."""
@@ -34,27 +42,31 @@ its cost, and changed (s,) int32, when it was changed last; where (n, 2) int32, 
 mate (3n,) int32, the linked half-edge or -1."""
 
 Search = namedtuple("Search", "level path saved shape cost pieces moves best spare order tried first")
-"""Working room of one search: level (k, 4) int32 by depth: next move, how many, virtual row, its end face; path (k, 14) int32, the rotations done: half-edges h, g, cut, its mate, rows a and b, how many
-rows there were, begin, count, length of a and of b, the top of the pieces; saved (k, 2) float64 their costs; shape (k, 4) int32
-by virtual row: strip, begin and count of its pieces, length; cost (k,) float64 (negative: not known); pieces
-(p, 2) int32: first and last place in the arena; moves (k, MOST_ROTATIONS, 8) int32 by depth: half-edges h, g,
-cut, side of the cut, row b (-1: as it lies), its strip, place of u, new end w; best (k, 3) int32 the rotations h, g, cut of the best find,
-then its merge. For the passes: spare (n,) int32, order and tried (s,) int32, first (LONGEST + 2,) int32."""
+"""Working room of one search:
+level (k, 4) int64 by depth: next move, how many there are, virtual row, its end face;
+path (k, 14) int64, the rotations done: half-edges h, g, cut, its mate, rows a and b, how many rows there
+were, begin, count, length of a and of b, top of the pieces; saved (k, 2) float64 the costs of a and b;
+shape (k, 4) int64 by virtual row: strip, begin and count of its pieces, length; cost (k,) float64 (negative:
+not known); pieces (p, 2) int64: first and last place in the arena;
+moves (k, MOST_ROTATIONS, 8) int64 by depth: half-edges h, g, cut, side of the cut, row b (-1: as it lies in
+the arena), its strip, place of u, new end w;
+best (k, 3) int64 the rotations h, g, cut of the best find, then its merge;
+for the passes: spare (n,) int32, order and tried (s,) int32, first (LONGEST + 2,) int32."""
 
 
-@njit(cache=True, nogil=True)
+@maker
 def room_for_search(deepest, faces, strips):
     """Room for a search of so many rotations over so many faces in so many strips."""
     depths = deepest + 2
     return Search(
-        np.empty((depths, 4), np.int32),
-        np.empty((depths, 14), np.int32),
+        np.empty((depths, 4), np.int64),
+        np.empty((depths, 14), np.int64),
         np.empty((depths, 2), np.float64),
-        np.empty((depths + 1, 4), np.int32),
+        np.empty((depths + 1, 4), np.int64),
         np.empty(depths + 1, np.float64),
-        np.empty((2 * depths * (depths + 2), 2), np.int32),
-        np.empty((depths, MOST_ROTATIONS, 8), np.int32),
-        np.empty((depths, 3), np.int32),
+        np.empty((2 * depths * (depths + 2), 2), np.int64),
+        np.empty((depths, MOST_ROTATIONS, 8), np.int64),
+        np.empty((depths, 3), np.int64),
         np.empty(faces, np.int32),
         np.empty(strips, np.int32),
         np.empty(strips, np.int32),
@@ -62,7 +74,7 @@ def room_for_search(deepest, faces, strips):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mirrors():
     """The table of reversed bits: entry m + i is i < m, m a power of two, with its log2(m) bits reversed."""
     table = np.zeros(2 * LONGEST, np.int32)
@@ -76,7 +88,7 @@ def mirrors():
     return table
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@spliced
 def box_area(boxes, row):
     """Half area of a box."""
     x = boxes[row, 3] + boxes[row, 0]
@@ -85,7 +97,7 @@ def box_area(boxes, row):
     return np.float64(x * y + y * z + z * x)
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@spliced
 def join_boxes(boxes, one, other, out, row):
     """Write the box around two to a row of `out`."""
     for q in range(6):
@@ -94,7 +106,7 @@ def join_boxes(boxes, one, other, out, row):
         out[row, q] = a if a > b else b
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def row_cost(rows, begin, length, boxes, mirror, room):
     """Areas of the inner nodes of the balanced tree over a row, and TOP_WEIGHT times that of its root.
 
@@ -129,7 +141,7 @@ def row_cost(rows, begin, length, boxes, mirror, room):
     return total + TOP_WEIGHT * box_area(room, 0)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def relabel(rows, begin, first, length, strip, where):
     """Tell the faces of a row from place `first` on which strip they are in, and where."""
     for place in range(first, length):
@@ -138,7 +150,7 @@ def relabel(rows, begin, first, length, strip, where):
         where[face, 1] = place
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def append_places(pieces, begin, count, first, last, top):
     """Write the pieces of the places first:last of a virtual row to the top; returns the new top."""
     place = 0
@@ -156,7 +168,7 @@ def append_places(pieces, begin, count, first, last, top):
     return top
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def turn_pieces(pieces, begin, end):
     """Turn a virtual row round."""
     while begin < end:
@@ -170,7 +182,7 @@ def turn_pieces(pieces, begin, end):
         begin += 1
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def take_up(strips, search, used, s, top):
     """Make strip s, as it lies in the arena, the virtual row `used`; returns the new top of the pieces."""
     shape = search.shape
@@ -184,13 +196,13 @@ def take_up(strips, search, used, s, top):
     return top + 1
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def locate(strips, search, used, face):
-    """The virtual row that holds a face, -1 where its strip is as it lies in the arena, and the place there."""
+    """The virtual row that holds a face (-1: its strip is as it lies in the arena) and the place there."""
     where, shape, pieces = strips.where, search.shape, search.pieces
     s = where[face, 0]
     place = np.int64(where[face, 1])
-    found = -1
+    found = NONE
     known = False
     for slot in range(used):
         known = known or shape[slot, 0] == s
@@ -210,11 +222,11 @@ def locate(strips, search, used, face):
     return found, place
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def face_at(rows, search, slot, place):
     """The face at a place of a virtual row."""
     begin = search.shape[slot, 1]
-    face = -1
+    face = NONE
     for k in range(begin, begin + search.shape[slot, 2]):
         one = search.pieces[k, 0]
         other = search.pieces[k, 1]
@@ -225,9 +237,9 @@ def face_at(rows, search, slot, place):
     return face
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def write_row(rows, search, slot, backwards, out, k):
-    """Write the faces of a virtual row, or those from its end to its head, to out from k on; returns the end."""
+    """Write the faces of a virtual row, forwards or from its end, to out from k on; returns the end."""
     begin = search.shape[slot, 1]
     count = search.shape[slot, 2]
     for i in range(count):
@@ -244,7 +256,7 @@ def write_row(rows, search, slot, backwards, out, k):
     return k
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
     """Do a rotation of virtual row a's end into place p of b, and note at path[d] how to undo it.
 
@@ -277,7 +289,7 @@ def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
     shape[a, 1] = top
     # Within one strip, turn round what is behind the link.
     if a == b:
-        middle = append_places(pieces, begin, shape[a, 2], 0, p + 1, top)
+        middle = append_places(pieces, begin, shape[a, 2], ZERO, p + 1, top)
         end = append_places(pieces, begin, shape[a, 2], p + 1, length, middle)
         turn_pieces(pieces, middle, end)
         shape[a, 2] = end - top
@@ -286,9 +298,9 @@ def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
         other = shape[b, 1]
         count = shape[b, 2]
         rest = shape[b, 3]
-        low = p if side == 0 else 0
+        low = p if side == 0 else ZERO
         high = rest if side == 0 else p + 1
-        middle = append_places(pieces, begin, shape[a, 2], 0, length, top)
+        middle = append_places(pieces, begin, shape[a, 2], ZERO, length, top)
         end = append_places(pieces, other, count, low, high, middle)
         if side == 1:
             turn_pieces(pieces, middle, end)
@@ -296,7 +308,7 @@ def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
         shape[a, 3] = length + high - low
         # Leave row b the rest, its new end last.
         top = end
-        low = 0 if side == 0 else p + 1
+        low = ZERO if side == 0 else p + 1
         high = p if side == 0 else rest
         end = append_places(pieces, other, count, low, high, top)
         if side == 1:
@@ -307,7 +319,7 @@ def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
     return end
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def undo(strips, search, d):
     """Undo the rotation of path[d]; returns how many virtual rows there were before."""
     path, shape = search.path, search.shape
@@ -326,22 +338,24 @@ def undo(strips, search, d):
     return path[d, 6]
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def change_of(strips, ground, search, used, skip, other):
-    """By how much the virtual rows, but for two that count as gone, are dearer than the strips they stand for."""
+    """By how much the virtual rows, but for two that are gone, are dearer than the strips were."""
     change = 0.0
     for slot in range(used):
         change -= strips.kept[search.shape[slot, 0]]
         if slot != skip and slot != other:
             # Work the cost out where it is not known.
             if search.cost[slot] < 0.0:
-                length = write_row(strips.rows, search, slot, False, ground.line, 0)
-                search.cost[slot] = row_cost(ground.line, 0, length, ground.boxes, ground.mirror, ground.room)
+                length = write_row(strips.rows, search, slot, FORWARDS, ground.line, ZERO)
+                search.cost[slot] = row_cost(
+                    ground.line, ZERO, length, ground.boxes, ground.mirror, ground.room
+                )
             change += search.cost[slot]
     return change
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def is_end(mate, face):
     """Whether a face has fewer than two links, and so stands at an end of its row."""
     free = 0
@@ -350,7 +364,7 @@ def is_end(mate, face):
     return free > 1
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def may_merge(strips, ground, search, used, w, freed, t, b, rest, most):
     """Whether w, an end of strip b of `rest` faces once its link by `freed` is cut, may find a partner."""
     found = False
@@ -376,9 +390,9 @@ def may_merge(strips, ground, search, used, w, freed, t, b, rest, most):
     return found
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def list_moves(strips, ground, search, used, d, rotations, neutral, most):
-    """List in moves[d] the rotations that the end at depth d may do; returns how many, MOST_ROTATIONS at most.
+    """List in moves[d] the rotations that the end at depth d may do, MOST_ROTATIONS at most: how many.
 
     The last one before a merge is listed only where a merge may follow, unless it may do without (neutral).
     """
@@ -393,13 +407,13 @@ def list_moves(strips, ground, search, used, d, rotations, neutral, most):
         while g != h:
             u = g // 3
             inner = mate[g] < 0 and u != t and not is_end(mate, u) and faces[u, g % 3] != faces[t, slot]
-            b = -1
-            p = 0
-            s = 0
-            length = 0
+            b = NONE
+            p = ZERO
+            s = ZERO
+            length = ZERO
             if inner:
                 b, p = locate(strips, search, used, u)
-                s = shape[b, 0] if b >= 0 else strips.where[u, 0]
+                s = shape[b, 0] if b >= 0 else np.int64(strips.where[u, 0])
                 length = shape[b, 3] if b >= 0 else strips.length[s]
                 inner = length <= LONGEST
             # Cut u's link towards the head (side 0) or the end (side 1); see that the lengths are right.
@@ -439,7 +453,7 @@ def list_moves(strips, ground, search, used, d, rotations, neutral, most):
     return count
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def keep_best(search, d, h, g):
     """Write the rotations done so far, and the merge by half-edges h and g behind them, to search.best."""
     for i in range(d):
@@ -449,7 +463,7 @@ def keep_best(search, d, h, g):
     search.best[d, 1] = g
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, most):
     """Look from the end of virtual row 0 for the best chain of exactly so many rotations, then a merge.
 
@@ -467,11 +481,11 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
     # A change that rounding could explain is worth nothing.
     best_worth = 1e-6 * strips.kept[shape[0, 0]]
     done = 0
-    used = 1
-    top = 1
-    d = 0
+    used = ONE
+    top = ONE
+    d = ZERO
     level[0, 2] = 0
-    level[0, 3] = face_at(rows, search, 0, shape[0, 3] - 1)
+    level[0, 3] = face_at(rows, search, ZERO, shape[0, 3] - 1)
     arrived = True
     while True:
         if arrived and d < rotations:
@@ -482,12 +496,12 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
             a = level[d, 2]
             t = level[d, 3]
             if 0 < d <= neutral:
-                change = change_of(strips, ground, search, used, -1, -1)
+                change = change_of(strips, ground, search, used, NONE, NONE)
                 if -change > best_worth:
                     best_worth = -change
                     found = True
                     found_change = change
-                    keep_best(search, d, -1, -1)
+                    keep_best(search, d, NONE, NONE)
             # Merge with each strip that ends beside this end, and see what that is worth.
             for slot in range(3):
                 h = 3 * t + slot
@@ -496,7 +510,7 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
                     u = g // 3
                     if mate[g] < 0 and u != t and is_end(mate, u) and faces[u, g % 3] != faces[t, slot]:
                         b, p = locate(strips, search, used, u)
-                        s = shape[b, 0] if b >= 0 else strips.where[u, 0]
+                        s = shape[b, 0] if b >= 0 else np.int64(strips.where[u, 0])
                         length = shape[b, 3] if b >= 0 else strips.length[s]
                         if a != b and shape[a, 3] + length <= most:
                             with_b = used
@@ -506,9 +520,11 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
                                 take_up(strips, search, b, s, top)
                             change = change_of(strips, ground, search, with_b, a, b)
                             if price - change > best_worth and change <= allowance:
-                                k = write_row(rows, search, a, False, ground.line, 0)
+                                k = write_row(rows, search, a, FORWARDS, ground.line, ZERO)
                                 k = write_row(rows, search, b, p > 0, ground.line, k)
-                                change += row_cost(ground.line, 0, k, ground.boxes, ground.mirror, ground.room)
+                                change += row_cost(
+                                    ground.line, ZERO, k, ground.boxes, ground.mirror, ground.room
+                                )
                             if price - change > best_worth and change <= allowance:
                                 best_worth = price - change
                                 found = True
@@ -544,14 +560,14 @@ def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, mo
     return found, found_change
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def accept(strips, ground, search, rotations, now, top):
     """Do the best chain that find_tunnel left, for good; returns the new top of the arena."""
     best, shape = search.best, search.shape
     rows = strips.rows
-    used = 1
-    a = 0
-    end = 1
+    used = ONE
+    a = ZERO
+    end = ONE
     for d in range(rotations):
         u = best[d, 1] // 3
         b, p = locate(strips, search, used, u)
@@ -559,22 +575,22 @@ def accept(strips, ground, search, rotations, now, top):
         if b < 0:
             b = used
             with_b = used + 1
-            end = take_up(strips, search, used, strips.where[u, 0], end)
+            end = take_up(strips, search, used, np.int64(strips.where[u, 0]), end)
         cut = best[d, 2]
         _, q = locate(strips, search, with_b, strips.mate[cut] // 3)
-        side = 0 if q < p else 1
+        side = ZERO if q < p else ONE
         end = rotate(strips, search, d, used, a, b, p, side, best[d, 0], best[d, 1], cut, end)
         used = with_b
         a = b
     # Append the other strip to the last end's.
-    gone = -1
+    gone = NONE
     h = best[rotations, 0]
     if h >= 0:
         g = best[rotations, 1]
         gone, p = locate(strips, search, used, g // 3)
         if gone < 0:
             gone = used
-            end = take_up(strips, search, used, strips.where[g // 3, 0], end)
+            end = take_up(strips, search, used, np.int64(strips.where[g // 3, 0]), end)
             used += 1
         strips.mate[h] = g
         strips.mate[g] = h
@@ -582,7 +598,7 @@ def accept(strips, ground, search, rotations, now, top):
     # Write the rows to the arena, and keep their costs.
     for slot in range(used):
         if slot != gone:
-            k = write_row(rows, search, slot, False, rows, top)
+            k = write_row(rows, search, slot, FORWARDS, rows, top)
             if slot == a and gone >= 0:
                 k = write_row(rows, search, gone, p > 0, rows, k)
             shape[slot, 1] = top
@@ -604,7 +620,7 @@ def accept(strips, ground, search, rotations, now, top):
     return top
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def compact(strips, spare):
     """Move the rows of the strips that are left to the arena's bottom, in order; returns the top."""
     k = 0
@@ -619,7 +635,7 @@ def compact(strips, spare):
     return k
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@helper
 def by_length(length, order, longest, first):
     """List the strips of up to `longest` faces in `order`, the shortest first, equals by number.
 
@@ -639,7 +655,7 @@ def by_length(length, order, longest, first):
     return first[longest]
 
 
-@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+@inlined
 def changed_near(strips, ring, s, since):
     """Whether strip s, or one that its ends might go into, has been changed after a time."""
     if strips.changed[s] > since:
@@ -656,7 +672,7 @@ def changed_near(strips, ring, s, since):
     return False
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@maker
 def search_range(strips, ground, search, most, deepest, neutral, price_share, rise, passes, leaves):
     """Improve the strips of a range in passes over them, the shortest first, from both ends.
 
@@ -687,7 +703,12 @@ def search_range(strips, ground, search, most, deepest, neutral, price_share, ri
         search.tried[s] = -1
         if strips.length[s] <= LONGEST:
             strips.kept[s] = row_cost(
-                strips.rows, strips.begin[s], strips.length[s], ground.boxes, ground.mirror, ground.room
+                strips.rows,
+                np.int64(strips.begin[s]),
+                np.int64(strips.length[s]),
+                ground.boxes,
+                ground.mirror,
+                ground.room,
             )
             start_cost += strips.kept[s]
             searched += 1
@@ -696,14 +717,14 @@ def search_range(strips, ground, search, most, deepest, neutral, price_share, ri
     price = price_share * (start_cost - leaves) / searched
     cost = start_cost
     most_cost = start_cost * (1.0 + rise)
-    top = faces
+    top = np.int64(faces)
     room = (2 * deepest + 4) * LONGEST
-    now = 0
+    now = ZERO
     for _ in range(passes):
         accepted = 0
         waiting = by_length(strips.length, search.order, longest, search.first)
         for k in range(waiting):
-            s = search.order[k]
+            s = np.int64(search.order[k])
             if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, search.tried[s]):
                 continue
             search.tried[s] = now
@@ -714,9 +735,9 @@ def search_range(strips, ground, search, most, deepest, neutral, price_share, ri
                     top = compact(strips, search.spare)
                 for rotations in range(deepest + 1):
                     # Go out from the end, or turned round from the head.
-                    take_up(strips, search, 0, s, 0)
+                    take_up(strips, search, ZERO, s, ZERO)
                     if side == 0:
-                        turn_pieces(search.pieces, 0, 1)
+                        turn_pieces(search.pieces, ZERO, ONE)
                     found, change = find_tunnel(
                         strips, ground, search, rotations, neutral, price, most_cost - cost, longest
                     )

@@ -1,7 +1,8 @@
 """Kernels of the collapse of a binary hierarchy to eight-wide nodes, and of the tracer's leaf blocks."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel
 
 WIDTH = 8
 """Children of a wide node and triangles of a leaf block: the float32 lanes of one AVX register."""
@@ -12,7 +13,7 @@ EMPTY = np.int32(-(2**31))
 """The child of an empty lane."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def half_area(boxes, p):
     """Half the surface area of one box, in float64: finite for all finite boxes."""
     dx = np.float64(boxes[p, 3]) - boxes[p, 0]
@@ -21,7 +22,7 @@ def half_area(boxes, p):
     return dx * dy + dy * dz + dz * dx
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
     """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
 
@@ -85,7 +86,7 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
     return split, as_leaf, cost[0, 1]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def gather_children(p, size, split, nodes, budget, children):
     """Write the binary nodes that become the children of the wide node at p, in order; return how many."""
     nodes[0] = p + 2 * size[p + 1]
@@ -113,7 +114,7 @@ def gather_children(p, size, split, nodes, budget, children):
     return found
 
 
-@njit(cache=True, nogil=True)
+@helper
 def assign_lanes(boxes, p, children, found, lane_of):
     """Give each child of p a lane, whose bits say on which side of p's centre it lies; best fits first."""
     taken = 0
@@ -144,7 +145,7 @@ def assign_lanes(boxes, p, children, found, lane_of):
         taken |= 1 << best_lane
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def emit_wide(boxes, size, split, as_leaf):
     """Lay out the wide nodes that `cheapest_forests` chose.
 
@@ -226,7 +227,7 @@ def emit_wide(boxes, size, split, as_leaf):
     )
 
 
-@njit(cache=True, nogil=True)
+@helper
 def comes_before(positions, a, b):
     """Whether position a is smaller than position b by x, then y, then z."""
     for axis in range(3):
@@ -235,13 +236,13 @@ def comes_before(positions, a, b):
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def flushed(value):
     """Zero for a denormal float32, as XLA has it."""
     return value if abs(value) >= LEAST_NORMAL else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_leaf_blocks(
     positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_bits, place
 ):
@@ -278,7 +279,7 @@ def fill_leaf_blocks(
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
 ):
