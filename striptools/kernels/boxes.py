@@ -1,12 +1,11 @@
-"""Bounding boxes of faces and of tree nodes, and the half area that the cost model weighs by."""
+"""Bounding boxes of faces and of ranges of items, and the half area that the cost model weighs by."""
 
 import numpy as np
-from numba import njit
 
-from striptools.kernels.compiled import kernel
+from striptools.kernels.compiled import inlined, kernel
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
     """Half the surface area in float64: finite float32 boxes cannot overflow it."""
     x = np.float64(hi_x) - np.float64(lo_x)
@@ -38,23 +37,3 @@ def range_boxes(boxes, items, starts, out):
             for axis in range(3):
                 out[part, axis] = min(out[part, axis], boxes[item, axis])
                 out[part, 3 + axis] = max(out[part, 3 + axis], boxes[item, 3 + axis])
-
-
-@kernel
-def node_boxes(order, size, item_boxes, boxes):
-    """Fill boxes (2n-1, 6) of a preorder tree from the boxes of its items."""
-    # Walk backwards, so that children come before their parents and leaves in falling position.
-    position = order.shape[0]
-    for node in range(size.shape[0] - 1, -1, -1):
-        # Copy the item's box into a leaf.
-        if size[node] == 1:
-            position -= 1
-            for k in range(6):
-                boxes[node, k] = item_boxes[order[position], k]
-            continue
-        # Join the boxes of the two children.
-        left = node + 1
-        right = node + 2 * size[left]
-        for axis in range(3):
-            boxes[node, axis] = min(boxes[left, axis], boxes[right, axis])
-            boxes[node, 3 + axis] = max(boxes[left, 3 + axis], boxes[right, 3 + axis])

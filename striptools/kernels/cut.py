@@ -1,5 +1,7 @@
 """Cut an object tree into ranges of leaves: the loop behind partition/cut.py."""
 
+import numpy as np
+
 from striptools.kernels.compiled import helper, kernel
 
 
@@ -26,8 +28,9 @@ def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
     only items count.
     """
     count = 0
-    node = 0
-    begin = 0
+    # Their type from the start: for a bare 0 Numba would compile meets_few once more.
+    node = np.int64(0)
+    begin = np.int64(0)
     while begin < order.shape[0]:
         items = size[node]
         fits = items == 1

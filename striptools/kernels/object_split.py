@@ -11,7 +11,6 @@ Centres are twice the box centre (lo + hi) in float64, where the sum of two floa
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
 from striptools.kernels.boxes import half_area
 from striptools.kernels.compiled import helper, inlined, kernel, maker
@@ -65,13 +64,13 @@ def fill_rows(boxes, weights, begin, end, rows):
     return -1
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def centre(boxes, position, axis):
     """Twice the centre of a box along an axis."""
     return np.float64(boxes[position, axis]) + np.float64(boxes[position, 3 + axis])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def join(box, boxes, row):
     """The box (a tuple of six, kept in registers) around a box and a row of boxes."""
     return (
@@ -90,7 +89,7 @@ def row_box(boxes, row):
     return (boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3], boxes[row, 4], boxes[row, 5])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def area(box):
     """Half area of a box that is not empty."""
     return half_area(box[0], box[1], box[2], box[3], box[4], box[5])
@@ -211,7 +210,7 @@ def best_bin(bounds, bins):
     return best_axis, best_slot
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def partition(rows, begin, end, axis, last_left, bin_count, bounds, spare, sides):
     """Move items in bins after `last_left` behind the others, both in order; returns the middle.
 
@@ -270,7 +269,7 @@ def load_short(rows, begin, count, short):
             short.rank[axis, short.before[i]] = i
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def sweep(short, begin, end):
     """The axis and the place (the first on the right) of the cheapest split over all places of all axes.
 

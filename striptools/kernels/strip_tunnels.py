@@ -584,6 +584,7 @@ def accept(strips, ground, search, rotations, now, top):
         a = b
     # Append the other strip to the last end's.
     gone = NONE
+    p = ZERO
     h = best[rotations, 0]
     if h >= 0:
         g = best[rotations, 1]
