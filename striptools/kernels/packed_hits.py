@@ -3,14 +3,14 @@
 from math import ldexp
 
 import numpy as np
-from numba import njit
 
 from striptools.kernels.blocks import axis_of, block_counts, take
+from striptools.kernels.compiled import kernel
 from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_corners
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_leaves(words, records, top_count):
     """Write to bits 24 to 31 of the word `leaves` of the nodes over blocks which of their slots are leaves."""
     for node in range(top_count):
@@ -22,7 +22,7 @@ def mark_leaves(words, records, top_count):
         words[node, 1] |= leaves << 24
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def depth_of(words, records, top_count):
     """The most nodes on a way from the root down; children come after their parents."""
     count = len(words)
@@ -44,7 +44,7 @@ def depth_of(words, records, top_count):
     return depth
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_of(headers, triangle):
     """The block that a triangle in file order is in."""
     low = np.int64(0)
@@ -58,7 +58,7 @@ def block_of(headers, triangle):
     return low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corner_indices(headers, words, block, t):
     """The indices of triangle t of a block: SPEC 4.3, alone."""
     count, _, _, has_flips, width = block_counts(headers, block)
@@ -91,7 +91,7 @@ def corner_indices(headers, words, block, t):
     return a, b, c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def scaled_vertex(headers, words, block, vertex, scale_exponent, corner):
     """Fill corner (3,) float32 with a block's vertex times 2**scale_exponent; zero for denormals."""
     count, _, strips, has_flips, index_width = block_counts(headers, block)
@@ -119,7 +119,7 @@ def scaled_vertex(headers, words, block, vertex, scale_exponent, corner):
         corner[axis] = -value if whole < 0 else value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weigh_packed_hits(
     origins,
     directions,

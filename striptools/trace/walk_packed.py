@@ -33,7 +33,7 @@ from jax import Array, lax
 from striptools.trace.box import Slab, passes
 from striptools.trace.numerics import folded, index, larger
 from striptools.trace.triangle import Shear, crossing_of, edges_of, pick
-from striptools.trace.walk import DONE, WIDTH, Best, Decode, Frame, WalkOptions, closer_of
+from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, closer_of
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
