@@ -136,7 +136,7 @@ def _read(file: IO[bytes], path: Path, folder: Path | None, name: str) -> Parsed
 
     readers: dict[str, Callable[[], Parsed]] = {
         "ply": lambda: ply.read_ply(file),
-        "obj": lambda: obj.read_obj(file),
+        "obj": lambda: obj.read_obj(file, folder),
         "stl": lambda: stl.read_stl(file),
         "off": lambda: off.read_off(file),
         "glb": lambda: gltf.read_glb(file, folder),
@@ -165,7 +165,14 @@ def _finish(parsed: Parsed) -> Mesh:
         raise UnreadableMeshError(
             f"{len(parsed.faces)} triangles", remedy=f"at most {MOST_FACES} are handled"
         )
-    return Mesh(_native(parsed.positions), parsed.faces.astype(np.int32), parsed.notes)
+    return Mesh(
+        _native(parsed.positions),
+        parsed.faces.astype(np.int32),
+        parsed.notes,
+        parsed.attributes,
+        parsed.materials,
+        parsed.unit,
+    )
 
 
 def _native(positions: np.ndarray) -> np.ndarray:
