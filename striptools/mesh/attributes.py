@@ -179,7 +179,7 @@ def narrowed(corners: np.ndarray, name: Name, faces: Faces, vertices: int) -> tu
     first = np.zeros(vertices, np.int64)
     first[flat[::-1]] = np.arange(len(flat))[::-1]
     differs = ~same_rows(corners, corners[first[flat]])
-    table = corners.reshape(len(faces), 3, -1)
+    table = corners.reshape(len(faces), 3, corners.shape[1])
     a_face = all(same_rows(table[:, k], table[:, 0]).all() for k in (1, 2))
     if not differs.any() and (vertices <= len(faces) or not a_face):
         return Attribute(name, "vertex", corners[first]), differs
@@ -216,7 +216,8 @@ def follow(
         if one.domain == "vertex":
             corners = one.values[kept.reshape(-1)]
         else:
-            corners = one.values.reshape(len(faces), 3, -1)[source_face].reshape(3 * len(kept), -1)
+            width = one.values.shape[1]
+            corners = one.values.reshape(len(faces), 3, width)[source_face].reshape(3 * len(kept), width)
         attribute, differs = narrowed(corners, one.name, welded, len(leaders))
         seams[welded.reshape(-1)[differs]] = True
         found.append(attribute)
@@ -244,7 +245,9 @@ def join_attributes(
     Returns:
         The attributes, and a note for each that some parts lack.
     """
-    names = [name for name in NAMES if any(one.name == name for _, _, found in parts for one in found)]
+    names: list[Name] = [
+        name for name in NAMES if any(one.name == name for _, _, found in parts for one in found)
+    ]
     joined, notes = [], []
     for name in names:
         own = [next((one for one in found if one.name == name), None) for _, _, found in parts]

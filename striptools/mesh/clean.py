@@ -3,9 +3,9 @@
 The order of the work, which decides what a face is counted under:
 
 1. Positions are rounded to float32 (to nearest); the largest rounding is reported. A value beyond float32's
-   range becomes infinite. float64 positions far from zero, as surveys and CAD have them, are first moved to an
-   origin of their own (recentre.py), where that leaves them much closer to what they were; float32 positions
-   never are.
+   range becomes infinite. float64 positions far from zero, as surveys and CAD have them, are first moved to
+   an origin of their own (recentre.py), where that leaves them much closer to what they were; float32
+   positions never are.
 2. Vertices are welded. By default those whose three words are equal BIT FOR BIT: so -0.0 and +0.0 stay apart,
    because positions have to come back bit-exact, and a seam of mixed zeros stays a seam. With a tolerance
    each vertex, by ascending index, moves to the nearest vertex before it that was not itself moved and lies

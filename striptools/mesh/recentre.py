@@ -1,9 +1,9 @@
 """Move float64 positions to an origin of their own, so that float32 loses least.
 
 A survey's coordinates are metres from a point hundreds of kilometres away, of which float32 keeps half a
-metre. Near their own middle it keeps millionths. The origin is the middle of the bounds, rounded to a multiple
-of a power of two as large as the model's half extent, so that taking it away is exact in float64 wherever the
-coordinate's last bit is not finer than the difference can hold; what is not exact is measured like the
+metre. Near their own middle it keeps millionths. The origin is the middle of the bounds, rounded to a
+multiple of a power of two near the model's half extent, so that taking it away is exact in float64 wherever
+the coordinate's last bit is not finer than the difference can hold; what is not exact is measured like the
 rounding to float32 that follows.
 
 A model gets an origin only where that makes its largest rounding `LEAST_GAIN` times smaller: every frame of

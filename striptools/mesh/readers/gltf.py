@@ -285,9 +285,7 @@ def _through_trimesh(
     if not wanted:
         return []
     used = {one["view"]["buffer"] for one in accessors}
-    files = {
-        str(index): document.buffer(index) if index in used else b"" for index in range(max(used) + 1)
-    }
+    files = {str(index): document.buffer(index) if index in used else b"" for index in range(max(used) + 1)}
     tree = {
         "asset": {"version": "2.0"},
         "buffers": [{"uri": name} for name in files],

@@ -1,4 +1,4 @@
-"""What a glTF primitive carries beside positions and indices: normals, texture coordinates, colours, material.
+"""What a glTF primitive carries beside positions and indices: normals, texture coordinates, colours.
 
 Nothing here refuses a file: what is malformed is left out, and a note counts it with what no mesh of ours
 keeps (Khronos glTF 2.0 specification, sections 3.7.2.1 and 3.9.2; KHR_mesh_quantization for small types).

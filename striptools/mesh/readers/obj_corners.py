@@ -1,4 +1,4 @@
-"""What an OBJ file says of corners, vertices and groups beside positions: vt, vn, colours, o, g, usemtl, mtllib.
+"""What an OBJ file says beside positions and faces: vt, vn, colours, o, g, usemtl, mtllib.
 
 Nothing here refuses a file: what makes no sense is left out and a note says so.
 """
@@ -24,7 +24,7 @@ from striptools.mesh.attributes import (
 from striptools.mesh.readers.parsed import Fans, counted, decode_text, left_out, numbers
 
 GROUP_LINE = re.compile(rb"^[ \t]*(o|g|usemtl|mtllib)(?:[ \t]+(.*))?$", re.MULTILINE)
-VALUE_LINES = {
+VALUE_LINES: dict[Name, re.Pattern[bytes]] = {
     "texcoord": re.compile(rb"^[ \t]*vt[ \t]+(.*)$", re.MULTILINE),
     "normal": re.compile(rb"^[ \t]*vn[ \t]+(.*)$", re.MULTILINE),
 }
@@ -53,7 +53,8 @@ def read_corner_values(
         return (), ("texture coordinates and normals left out: the faces name them in no known way",)
     lengths = [len(line.split()) for line in faces]
     found, notes = [], ()
-    for name, column in (("normal", 2), ("texcoord", 1)):
+    columns: tuple[tuple[Name, int], ...] = (("normal", 2), ("texcoord", 1))
+    for name, column in columns:
         if values[name] and indices[:, column].any():
             before = _lines_before(text, VALUE_LINES[name], face_line, lengths, indices[:, column])
             one, more = _corner_attribute(name, values[name], before, fans)

@@ -273,9 +273,7 @@ def _through_trimesh(file: IO[bytes], header: Header) -> Parsed | None:
     return _with_columns(parsed, vertices, raw["face"]["data"], header)
 
 
-def _with_columns(
-    parsed: Parsed, vertices: np.ndarray, faces: np.ndarray, header: Header
-) -> Parsed | None:
+def _with_columns(parsed: Parsed, vertices: np.ndarray, faces: np.ndarray, header: Header) -> Parsed | None:
     """The mesh of triangles with what its other columns say, or None where their lists have other lengths."""
     element = header.element("face")
 

@@ -16,6 +16,11 @@ from striptools.mesh.readers.parsed import Fans, left_out
 NORMALS = (("nx", "ny", "nz"),)
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+KNOWN: tuple[tuple[Name, tuple[tuple[str, ...], ...]], ...] = (
+    ("normal", NORMALS),
+    ("texcoord", TEXCOORDS),
+    ("color", COLOURS),
+)
 ALPHAS = {"red": "alpha", "r": "a", "diffuse_red": "diffuse_alpha"}
 WEDGES = ("texcoord",)
 
@@ -29,7 +34,7 @@ Read = Callable[[str], np.ndarray | None]
 def vertex_attributes(columns: Columns, read: Read) -> tuple[list[Attribute], list[str]]:
     """The attributes that the columns of the vertices are, and the names of the columns left out."""
     found, used = [], set()
-    for name, choices in (("normal", NORMALS), ("texcoord", TEXCOORDS), ("color", COLOURS)):
+    for name, choices in KNOWN:
         names = _choose(columns, choices)
         one = _attribute(name, "vertex", names, columns, read)
         if one is not None:
