@@ -1,34 +1,35 @@
-"""The data's way in one screen: load, clean, partition, order, hierarchy, output, scene.
+"""The data's way in one screen: load, clean, quantise, partition, order, hierarchy, output, scene.
 
 Source: the four steps of Strip-RT (Lauterbach, Yoon, Tang, Manocha, EGSR 2008, section 4) between a loader
 that hides nothing and a scene that can be traced as it lies.
 """
 
-import os
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, get_args
 
 import numpy as np
 
+from striptools import __version__
 from striptools.errors import UnreadableMeshError, UsageError
-from striptools.hierarchies.strip_bvh import build_strip_hierarchy
+from striptools.hierarchies.packed import box_grid, build_top
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
-from striptools.reducem.reader import read_scene
-from striptools.reducem.scene import Scene, scene_from_strips
+from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise
+from striptools.reducem.reader import open_scene
+from striptools.reducem.scene import BoxesKind, Scene, bounds_of, scene_from_strips
 from striptools.stopwatch import Stopwatch, Watch
+from striptools.strips.grouping import reorder_blocks, stripify_in_blocks
 from striptools.strips.ordering import OrderingOptions
-from striptools.strips.stripify import stripify
-from striptools.strips.topology import encode_strips
-from striptools.types import Faces, Positions
+from striptools.strips.topology import encode_strips, split_fans
+from striptools.threads import every_core
 
-STAGES = ("load", "clean", "partition", "order", "hierarchy", "output")
+STAGES = ("load", "clean", "quantise", "partition", "order", "hierarchy", "output")
 """The stages of a conversion, in order; `order` finds the neighbours too, range by range; a command that
 writes the scene adds `write`."""
 
@@ -39,24 +40,30 @@ class Options:
 
     Attributes:
         clean: Welding and duplicates.
+        precision: Every bit of float32, or a grid.
         partition: The SAH object split.
         ordering: Strips: method, cap, effort, blocks.
+        boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:
-        UsageError: `threads` is below 1.
+        UsageError: `threads` is below 1, or `boxes` is neither.
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)
+    precision: PrecisionOptions = field(default_factory=PrecisionOptions)
     partition: PartitionOptions = field(default_factory=PartitionOptions)
     ordering: OrderingOptions = field(default_factory=OrderingOptions)
+    boxes: BoxesKind = "rebuilt"
     remap: bool = True
     threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.threads is not None and self.threads < 1:
             raise UsageError(f"not a number of threads: {self.threads}", remedy="give 1 or more")
+        if self.boxes not in get_args(BoxesKind):
+            raise UsageError(f"{self.boxes!r} is not known", where="boxes", remedy="give rebuilt or stored")
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,8 @@ class Report:
         counts: Faces and vertices in and out, and how many were dropped for which reason.
         largest_rounding: The largest change of a coordinate by rounding to float32, in the model's unit.
         weld_error: The largest distance by which welding moved a vertex, in the model's unit.
+        grid_exponent: Positions were moved to multiples of 2 to this power; None where every bit is kept.
+        largest_error: The largest distance of a vertex from the loaded one where there is a grid, else None.
         notes: What loading had to say.
     """
 
@@ -77,6 +86,8 @@ class Report:
     counts: dict[str, int]
     largest_rounding: float
     weld_error: float
+    grid_exponent: int | None
+    largest_error: float | None
     notes: tuple[str, ...]
 
 
@@ -125,69 +136,109 @@ def convert_with_report(
         LimitError: The mesh is larger than a scene can hold.
     """
     options = options or Options()
-    threads = options.threads or len(os.sched_getaffinity(0))
+    threads = options.threads or every_core()
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
+        metadata = _metadata(source)
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)
-        faces, positions = _remaining(cleaned)
+        _refuse_nothing(cleaned)
         source_face_count, notes = mesh.triangle_count, mesh.notes
+    with clock.stage("quantise"):
+        cleaned, exponent, bound, largest_error = _quantised(mesh, cleaned, options, threads)
+        faces, positions = cleaned.mesh.faces, cleaned.mesh.positions
         del mesh, source
     with clock.stage("partition"):
         boxes = face_boxes(positions, faces, threads)
-        block = options.ordering.block or options.partition.block
-        tree = split_objects(boxes, replace(options.partition, block=block), threads=threads)
+        block = options.ordering.block if options.ordering.method == "strip-rt" else None
+        tree = split_objects(
+            boxes, replace(options.partition, block=block or options.partition.block), threads=threads
+        )
     with clock.stage("order"):
         progress = None if watch is None else partial(watch, "order")
-        sequences = stripify(faces, len(positions), boxes, tree, options.ordering, threads, progress)
-        del tree
+        given = (faces, len(positions), boxes, tree, options.ordering, options.partition)
+        sequences, starts = stripify_in_blocks(*given, threads, progress)
+        del tree, given
     with clock.stage("hierarchy"):
-        strip_boxes = range_boxes(boxes, sequences.starts, sequences.faces)
-        triangle_counts = np.diff(sequences.starts)
-        order, hierarchy = build_strip_hierarchy(
-            strip_boxes, triangle_counts, replace(options.partition, block=None), threads=threads
-        )
-        del boxes, strip_boxes
+        block_boxes = range_boxes(boxes, starts, sequences.faces)
+        order, top = build_top(block_boxes, np.diff(starts), box_grid(*bounds_of(positions)), threads)
+        sequences, starts = reorder_blocks(sequences, starts, order)
+        del boxes, block_boxes
     with clock.stage("output"):
-        strips = encode_strips(faces, sequences.reordered(order), threads)
+        strips = split_fans(encode_strips(faces, sequences, threads), faces, threads)
         scene = scene_from_strips(
             positions,
             strips,
-            hierarchy,
+            starts,
+            top,
             source_face=cleaned.source_face if options.remap else None,
             source_face_count=source_face_count,
-            error_bound=cleaned.weld_error,
+            grid_exponent=exponent,
+            error_bound=bound,
+            metadata=metadata,
             threads=threads,
         )
-    counts = cleaned.counts | {"strips": scene.strip_count}
+        if options.boxes == "stored":
+            scene = scene.storing_boxes(threads)
+    counts = cleaned.counts | {"strips": scene.strip_count, "blocks": scene.block_count}
     seconds, peak = clock.read()
-    return scene, Report(seconds, peak, counts, cleaned.largest_rounding, cleaned.weld_error, notes)
+    moved = (cleaned.largest_rounding, cleaned.weld_error, exponent, largest_error)
+    return scene, Report(seconds, peak, counts, *moved, notes)
 
 
 def open(source: str | Path | IO[bytes]) -> Scene:
-    """Read a ReduceM scene file.
+    """Open a ReduceM scene file: map it, and look at its header and section table.
+
+    What else the file holds is read and checked when it is first asked for; `scene.check()` checks all of it.
 
     Args:
-        source: The path of a `.rdm` file, or a binary stream of one.
+        source: The path of a `.rdm` file, which must not be changed in place while the scene is used, or a
+            binary stream of one, which is read whole.
 
     Returns:
-        The scene.
+        The scene; its fields and methods raise UnreadableSceneError where the file breaks a rule.
 
     Raises:
         UnreadableSceneError: The file is missing, damaged, or no scene file of a version that is read here.
     """
-    return read_scene(source)
+    return open_scene(source)
 
 
-def _remaining(cleaned: Cleaned) -> tuple[Faces, Positions]:
+def _refuse_nothing(cleaned: Cleaned, prefix: str = "") -> None:
     if cleaned.mesh.triangle_count == 0:
         reasons = ("non_finite", "repeated_vertex", "zero_area")
+        counts = {reason: cleaned.counts.get(prefix + reason, 0) for reason in reasons}
         dropped = ", ".join(
-            f"{cleaned.counts[r]} {r.replace('_', ' ')}" for r in reasons if cleaned.counts[r]
+            f"{count} {reason.replace('_', ' ')}" for reason, count in counts.items() if count
         )
         raise UnreadableMeshError(
-            f"no face is left after cleaning: {dropped or 'there was none'}",
-            remedy="a scene needs a triangle with an area",
+            f"no face is left after {'quantising' if prefix else 'cleaning'}: {dropped or 'there was none'}",
+            remedy="give more bits" if prefix else "a scene needs a triangle with an area",
         )
-    return cleaned.mesh.faces, cleaned.mesh.positions
+
+
+def _quantised(
+    mesh: Mesh, cleaned: Cleaned, options: Options, threads: int
+) -> tuple[Cleaned, int | None, float, float | None]:
+    """The mesh on its grid where one is asked for, the grid's exponent, the bound and the largest error."""
+    if options.precision.is_lossless:
+        return cleaned, None, cleaned.weld_error, None
+    drop = options.clean.drop_duplicates
+    moved = quantise(cleaned, options.precision, drop_duplicates=drop, threads=threads)
+    _refuse_nothing(moved.cleaned, "quantised_")
+    largest = check_bound(mesh, moved.cleaned.mesh, moved.cleaned.source_face, moved.error_bound)
+    return moved.cleaned, moved.grid_exponent, moved.error_bound, largest
+
+
+def _metadata(source: Mesh | str | Path | IO[bytes]) -> dict[str, Any]:
+    metadata = {"generator": f"striptools {__version__}"}
+    if isinstance(source, str | Path):
+        metadata["source"] = Path(source).name
+        if Path(source).suffix.lower() in _METRES:
+            metadata["unit"] = "m"
+    return metadata
+
+
+_METRES = (".glb", ".gltf")
+"""Formats whose unit is the metre by their specification."""

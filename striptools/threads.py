@@ -4,6 +4,7 @@ Neither decides anything: the caller's kernels write to disjoint places or retur
 that results do not depend on the number of threads.
 """
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
@@ -16,6 +17,11 @@ CHUNKS_A_THREAD = 4
 """So that a thread that is held up does not hold up the others for long."""
 
 Result = TypeVar("Result")
+
+
+def every_core() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def in_chunks(

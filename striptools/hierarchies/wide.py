@@ -66,7 +66,12 @@ def collapse(tree: BinaryTree, leaf_size: int = WIDTH) -> WideTree:
         leaf_size: The most triangles of a leaf, 1 to 8.
     """
     split, as_leaf, _ = cheapest_forests(
-        tree.boxes, tree.size, leaf_size, np.float32(WIDE_NODE_COST), np.float32(LEAF_BLOCK_COST)
+        tree.boxes,
+        tree.size,
+        leaf_size,
+        np.float32(WIDE_NODE_COST),
+        np.float32(LEAF_BLOCK_COST),
+        np.float32(0),
     )
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))

@@ -44,3 +44,46 @@ def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
         else:
             node += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def group_strips(size, order, starts, faces, seen, most_triangles, most_vertices, firsts):
+    """Write the first places of the largest subtrees over strips within both limits; returns how many.
+
+    Args:
+        size: (2s-1,) int32, the strips below each node of a preorder tree.
+        order: (s,) int32, the strip at each leaf.
+        starts: (s+1,) int32, the first of each strip's faces.
+        faces: (n, 3) int32, in the order of the strips.
+        seen: (v,) int32, -1.
+        most_triangles: The most faces of a group; no strip has more.
+        most_vertices: The most different vertices of a group; no strip has more.
+        firsts: (s+1,) int32 to fill with places in `order`.
+    """
+    count = 0
+    node = 0
+    begin = 0
+    while begin < order.shape[0]:
+        # Count the faces and the vertices of the subtree until they are too many.
+        items = size[node]
+        triangles = 0
+        vertices = 0
+        for place in range(begin, begin + items if items > 1 else begin):
+            strip = order[place]
+            triangles += starts[strip + 1] - starts[strip]
+            if triangles > most_triangles or vertices > most_vertices:
+                break
+            for k in range(starts[strip], starts[strip + 1]):
+                for corner in range(3):
+                    if seen[faces[k, corner]] != node:
+                        seen[faces[k, corner]] = node
+                        vertices += 1
+        # Take the whole subtree and step behind it, or look at its left child.
+        if triangles <= most_triangles and vertices <= most_vertices:
+            firsts[count] = begin
+            count += 1
+            begin += items
+            node += 2 * items - 1
+        else:
+            node += 1
+    return count

@@ -22,7 +22,7 @@ def half_area(boxes, p):
 
 
 @njit(cache=True, nogil=True)
-def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
+def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
     """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
 
     Args:
@@ -31,12 +31,14 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
         leaf_size: The most triangles of a leaf.
         node_cost: The cost of visiting a wide node.
         leaf_cost: The cost of testing a leaf, full or not.
+        node_price: What a wide node costs beside its visits, in visits of the root: a saving below it is not
+            worth another node.
 
     Returns:
         split: (2n-1, 9) int8; `split[p, j]`, j >= 2, says how many of j children the left subtree gets, 0
             means that fewer than j are as cheap; `split[p, 8]` is the split of p as a wide node of its own.
         as_leaf: (2n-1,) bool, p standing alone is cheapest as a leaf.
-        cost: The expected cost of the whole tree for a ray that meets the root's box.
+        cost: The expected cost of the whole tree for a ray that meets the root's box, and the prices.
     """
     count = len(size)
     cost = np.empty((count, WIDTH), np.float32)
@@ -65,7 +67,7 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost):
                 split[p, WIDTH] = k
 
         # Choose between a wide node and, where the triangles are few enough, a leaf.
-        inner = best + area * node_cost
+        inner = best + area * node_cost + node_price
         leaf = area * leaf_cost
         if size[p] <= leaf_size and leaf <= inner:
             as_leaf[p] = True

@@ -1,28 +1,49 @@
-"""The rules that the arrays of a scene keep (SPEC.md, section 4), asked by the writer and the reader."""
+"""The rules that a scene keeps (SPEC.md, section 4), asked by the writer and the reader."""
 
 import math
+from typing import Any
 
 import numpy as np
 
-from striptools.errors import LimitError, UsageError
-from striptools.hierarchies import check as hierarchy_check
+from striptools.errors import LimitError, UnreadableSceneError, UsageError
+from striptools.hierarchies.packed import check_packed
 from striptools.kernels import scene as kernels
+from striptools.reducem import layout
+from striptools.reducem.blocks import check_headers
 from striptools.reducem.issues import unreadable
-from striptools.reducem.layout import SOURCE_FACE_LIMIT, TRIANGLE_LIMIT
-from striptools.reducem.scene import Scene
-from striptools.types import Boxes, FaceIds
+from striptools.reducem.scene import Remap, Scene, bounds_of
+from striptools.types import FaceIds
 
-__all__ = ["check_limits", "check_scene", "strip_boxes"]
+__all__ = ["check_limits", "check_nodes", "check_remap", "check_scene"]
 
 LARGEST_SHARE = 8
 """Source faces per triangle up to which a table of the source's faces is made: a byte each."""
 
-_HIERARCHY_CODES = {
-    hierarchy_check.WRONG_SIZE: "RDM114",
-    hierarchy_check.EMPTY_CHILD: "RDM401",
-    hierarchy_check.NOT_FINITE: "RDM402",
-    hierarchy_check.NOT_HELD: "RDM403",
+_NODE_CODES = {
+    "a wrong number of top nodes": "RDM201",
+    "a wrong number of nodes": "RDM201",
+    "runs are not there as a whole": "RDM113",
+    "a wrong longest run": "RDM207",
+    "a slot is neither empty nor has a box": "RDM705",
+    "an empty slot is inner": "RDM705",
+    "a node without inner children has a base": "RDM706",
+    "a node without leaves has leaves": "RDM706",
+    "a node has no child": "RDM708",
+    "a node comes before its parent": "RDM701",
+    "a top node has not one parent": "RDM702",
+    "a node has not one parent": "RDM702",
+    "a block has not one parent": "RDM703",
+    "a node names another block than its own": "RDM704",
+    "a node has a run of another block": "RDM704",
+    "a run has not one parent": "RDM704",
+    "the runs of blocks do not follow each other": "RDM801",
+    "reserved bits of a run are set": "RDM107",
+    "a run is too long": "RDM802",
+    "a run goes on in another strip": "RDM802",
+    "the runs do not hold every triangle once": "RDM803",
+    "a box does not hold what is below it": "RDM707",
 }
+"""Of what `check_packed` says."""
 
 
 def check_limits(scene: Scene) -> None:
@@ -31,59 +52,122 @@ def check_limits(scene: Scene) -> None:
     Raises:
         LimitError: It is.
     """
-    if scene.triangle_count > TRIANGLE_LIMIT:
-        raise LimitError(
-            f"{scene.triangle_count} triangles are more than {TRIANGLE_LIMIT}",
-            remedy="split it",
-        )
-    if scene.source_face_count > SOURCE_FACE_LIMIT:
-        raise LimitError(
-            f"{scene.source_face_count} source faces are more than {SOURCE_FACE_LIMIT}",
-            remedy="split the mesh",
-        )
+    sizes = (
+        (scene.source_face_count, layout.SOURCE_FACE_LIMIT, "source faces"),
+        (scene.block_count, layout.BLOCK_LIMIT, "blocks"),
+        (len(scene.packed.nodes), layout.NODE_LIMIT, "nodes"),
+    )
+    for size, most, name in sizes:
+        if size > most:
+            raise LimitError(f"{size} {name} are more than {most}", remedy="split the mesh")
 
 
 def check_scene(scene: Scene, where: str = "scene") -> None:
     """Make sure that a scene keeps every rule of the format.
 
     Args:
-        scene: The scene in question; its strips are decoded, once.
+        scene: The scene in question; its blocks are decoded, once.
         where: What the error names as its place.
 
     Raises:
+        LimitError: It is larger than the format can hold.
         UsageError: An array has the wrong dtype.
         UnreadableSceneError: Naming the first rule broken, by its code.
     """
+    check_limits(scene)
     _check_dtypes(scene)
-    _check_counts(scene, where)
-    _check_strips(scene, where)
-    _check_vertices(scene, where)
-    flaw = hierarchy_check.strip_hierarchy_flaw(scene.hierarchy, strip_boxes(scene))
-    if flaw is not None:
-        raise unreadable(_HIERARCHY_CODES[flaw[0]], f"{where}: HIER: node {flaw[1]}")
-    _check_remap(scene, where)
+    check_record(scene, where)
+    if scene.block_count:
+        check_headers(scene.blocks, scene.triangle_count, where)
+    _check_positions(scene, where)
+    check_nodes(scene, where)
+    check_remap(scene.remap, scene.triangle_count, scene.source_face_count, where)
+    check_metadata(scene.metadata, where)
 
 
-def strip_boxes(scene: Scene) -> Boxes:
-    """Box the vertices of each strip.
+def check_record(scene: Scene, where: str) -> None:
+    """Make sure that the numbers of the scene record are in their ranges.
 
-    Returns:
-        (s, 6) float32.
+    Raises:
+        UnreadableSceneError: They are not.
     """
-    boxes = np.zeros((scene.strip_count, 6), np.float32)
-    positions, vertices = np.ascontiguousarray(scene.positions), np.ascontiguousarray(scene.vertices)
-    kernels.strip_boxes(positions, vertices, scene.starts, 0, scene.strip_count, boxes)
-    return boxes
+    place, exponent = f"{where}: SCEN", scene.grid_exponent
+    if scene.source_face_count < scene.triangle_count:
+        raise unreadable("RDM201", place)
+    if not (math.isfinite(scene.error_bound) and scene.error_bound >= 0.0):
+        raise unreadable("RDM202", place)
+    if exponent is not None and exponent not in layout.GRID_EXPONENTS:
+        raise unreadable("RDM203", place)
+    if not (np.isfinite(scene.low).all() and np.isfinite(scene.high).all()):
+        raise unreadable("RDM205", place)
+    if any(int(cell) not in layout.CELL_EXPONENTS for cell in scene.grid.cell):
+        raise unreadable("RDM206", place)
+    if scene.block_count == 0 and (scene.low.any() or scene.high.any() or scene.grid.cell.any()):
+        raise unreadable("RDM208", place)
+
+
+def check_nodes(scene: Scene, where: str) -> None:
+    """Make sure that the hierarchy reaches everything once and that its boxes hold what is below them.
+
+    Raises:
+        UnreadableSceneError: It does not.
+    """
+    if scene.block_count == 0:
+        if len(scene.packed.nodes) or scene.packed.runs is not None:
+            raise unreadable("RDM208", f"{where}: SCEN")
+        return
+    given = (scene.grid, scene.triangle_boxes(), scene.block_starts, scene.starts)
+    try:
+        check_packed(scene.packed, *given)
+    except UnreadableSceneError as error:
+        code = _NODE_CODES.get(error.what)
+        if code is None:
+            raise
+        raise unreadable(code, f"{where}: {'RUNS' if code[3] == '8' else 'NODE'}") from error
+
+
+def check_remap(remap: Remap | None, triangle_count: int, source_face_count: int, where: str) -> None:
+    """Make sure that a remap names each triangle's face and rotation.
+
+    Raises:
+        UnreadableSceneError: It does not.
+    """
+    if remap is None:
+        return
+    if len(remap.face) != triangle_count or len(remap.rotation) != triangle_count:
+        raise unreadable("RDM114", f"{where}: RMAP")
+    wrong = np.flatnonzero(remap.rotation > 2)
+    if len(wrong):
+        raise unreadable("RDM501", f"{where}: RMAP: triangle {wrong[0]}")
+    outside = np.flatnonzero((remap.face < 0) | (remap.face >= source_face_count))
+    if len(outside):
+        raise unreadable("RDM502", f"{where}: RMAP: triangle {outside[0]}")
+    if _has_repeat(remap.face, source_face_count):
+        raise unreadable("RDM503", f"{where}: RMAP")
+
+
+def check_metadata(metadata: Any, where: str) -> None:
+    """Make sure that metadata are an object and that its known names are strings.
+
+    Raises:
+        UnreadableSceneError: They are not.
+    """
+    if not isinstance(metadata, dict):
+        raise unreadable("RDM901", f"{where}: META")
+    for name in layout.METADATA_NAMES:
+        if not isinstance(metadata.get(name, ""), str):
+            raise unreadable("RDM903", f"{where}: META: {name}")
 
 
 def _check_dtypes(scene: Scene) -> None:
     wanted = [
-        ("positions", scene.positions, np.float32),
-        ("vertices", scene.vertices, np.int32),
-        ("turns", scene.turns, np.bool_),
-        ("starts", scene.starts, np.int32),
-        ("hierarchy.boxes", scene.hierarchy.boxes, np.float32),
-        ("hierarchy.left_count", scene.hierarchy.left_count, np.uint32),
+        ("blocks.headers", scene.blocks.headers, np.uint32),
+        ("blocks.words", scene.blocks.words, np.uint32),
+        ("packed.nodes", scene.packed.nodes, np.uint32),
+        ("packed.first_run", scene.packed.first_run, np.uint32),
+        ("packed.runs", scene.packed.runs, np.uint16),
+        ("low", scene.low, np.float32),
+        ("high", scene.high, np.float32),
     ]
     if scene.remap is not None:
         wanted += [
@@ -91,61 +175,22 @@ def _check_dtypes(scene: Scene) -> None:
             ("remap.rotation", scene.remap.rotation, np.uint8),
         ]
     for name, array, dtype in wanted:
-        if array.dtype != dtype:
+        if array is not None and array.dtype != dtype:
             raise UsageError(f"{name} has dtype {array.dtype}, not {np.dtype(dtype)}", where="scene")
 
 
-def _check_counts(scene: Scene, where: str) -> None:
-    triangles, strips, vertices = scene.triangle_count, scene.strip_count, scene.vertex_count
-    corners = triangles + 2 * strips
-    in_range = 1 <= strips <= triangles <= TRIANGLE_LIMIT and 3 <= vertices <= corners
-    if not (in_range and triangles <= scene.source_face_count <= SOURCE_FACE_LIMIT):
-        raise unreadable("RDM201", f"{where}: SCEN")
-    if not (math.isfinite(scene.error_bound) and scene.error_bound >= 0.0):
-        raise unreadable("RDM202", f"{where}: SCEN")
-    if len(scene.vertices) != corners or scene.positions.shape != (vertices, 3):
-        raise unreadable("RDM114", f"{where}: SVTX")
-
-
-def _check_strips(scene: Scene, where: str) -> None:
-    starts = scene.starts
-    rising = (starts[1:] > starts[:-1]).all()
-    if not (rising and starts[0] == 0 and starts[-1] == scene.triangle_count):
-        raise unreadable("RDM302", f"{where}: STRT")
-    turned = np.flatnonzero(scene.turns[starts[:-1]])
-    if len(turned):
-        raise unreadable("RDM303", f"{where}: TURN: strip {turned[0]}")
-
-
-def _check_vertices(scene: Scene, where: str) -> None:
-    stray = kernels.first_row_not_finite(scene.positions, 0, scene.vertex_count)
-    if stray >= 0:
-        raise unreadable("RDM301", f"{where}: POSN: position {stray}")
-    flaw, entry, largest = kernels.first_vertex_flaw(scene.vertices, scene.vertex_count)
-    if flaw:
-        code = "RDM305" if flaw == kernels.OUTSIDE else "RDM306"
-        raise unreadable(code, f"{where}: SVTX: entry {entry}")
-    if largest != scene.vertex_count - 1:
-        raise unreadable("RDM307", f"{where}: POSN: position {largest + 1}")
-    repeated = kernels.first_repeated_corner(scene.faces(), 0, scene.triangle_count)
-    if repeated >= 0:
-        raise unreadable("RDM308", f"{where}: SVTX: triangle {repeated}")
-
-
-def _check_remap(scene: Scene, where: str) -> None:
-    if scene.remap is None:
+def _check_positions(scene: Scene, where: str) -> None:
+    low, high = bounds_of(scene.positions)
+    same = np.array_equal(low.view(np.uint32), scene.low.view(np.uint32)) and np.array_equal(
+        high.view(np.uint32), scene.high.view(np.uint32)
+    )
+    if not same or not np.array_equal(low.view(np.uint32), scene.grid.low.view(np.uint32)):
+        raise unreadable("RDM205", f"{where}: SCEN")
+    if scene.grid_exponent is None:
         return
-    face, rotation = scene.remap.face, scene.remap.rotation
-    if len(face) != scene.triangle_count or len(rotation) != scene.triangle_count:
-        raise unreadable("RDM114", f"{where}: RMAP")
-    wrong = np.flatnonzero(rotation > 2)
-    if len(wrong):
-        raise unreadable("RDM501", f"{where}: RMAP: triangle {wrong[0]}")
-    outside = np.flatnonzero((face < 0) | (face >= scene.source_face_count))
-    if len(outside):
-        raise unreadable("RDM502", f"{where}: RMAP: triangle {outside[0]}")
-    if _has_repeat(face, scene.source_face_count):
-        raise unreadable("RDM503", f"{where}: RMAP")
+    row = kernels.first_row_off_grid(scene.positions, math.ldexp(1.0, -scene.grid_exponent))
+    if row >= 0:
+        raise unreadable("RDM204", f"{where}: BLKD: vertex {row}")
 
 
 def _has_repeat(face: FaceIds, source_face_count: int) -> bool:
@@ -154,11 +199,3 @@ def _has_repeat(face: FaceIds, source_face_count: int) -> bool:
         return bool(kernels.has_repeat(face, np.zeros(source_face_count, np.bool_)))
     ordered = np.sort(face)
     return bool((ordered[1:] == ordered[:-1]).any())
-
-
-# Notes. Stanford dragon (871,306 triangles), milliseconds of processor time, one thread, before and after:
-# encode 73 / 25, scene 32 / 10, file written with every check 95 / 20. Of the 20: checks 11 (hierarchy 5,
-# decoding 2, vertices 2, boxes of strips 1, remap 1), checksums 3 to 5, the file the rest. Nothing is left
-# out for a scene that this program made: every rule is asked before the first byte is written. What had cost
-# most was sorting the remap (35), and gathering corners in NumPy (20 to 35 each for decoding, boxes, first
-# uses).

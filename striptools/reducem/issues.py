@@ -1,13 +1,19 @@
-"""Every flaw of a scene file, by a code that users can cite; formats/reducem/ISSUES.md lists the same."""
+"""Every flaw of a scene file, by a code that users can cite; formats/reducem/ISSUES.md lists the same.
 
+Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 6 blocks, 7 nodes, 8 runs, 9 metadata.
+Those of 3 and 4 belonged to formats before 0.3 and are not used again.
+"""
+
+import sys
 from dataclasses import dataclass
 
 from striptools.errors import UnreadableSceneError
 
-__all__ = ["ISSUES", "Finding", "Issue", "unreadable"]
+__all__ = ["ISSUES", "Finding", "Issue", "catalogue", "unreadable"]
 
 _DAMAGED = "get the file again, or convert the model again"
 _WRITER = "report it to the maker of the program that wrote the file"
+_UPDATE = "update striptools"
 
 
 @dataclass(frozen=True)
@@ -23,10 +29,11 @@ class Issue:
 
 @dataclass(frozen=True)
 class Finding:
-    """An issue found in a file, and where."""
+    """An issue found in a file, and where; `offset` is the byte of the file, None where none is to blame."""
 
     issue: Issue
     where: str
+    offset: int | None = None
 
     def __str__(self) -> str:
         """Give one line for the user."""
@@ -34,46 +41,82 @@ class Finding:
         return f"{place}{self.issue.code} {self.issue.message} ({self.issue.remedy})"
 
 
+def _flaw(code: str, clause: str, message: str, remedy: str = _WRITER) -> Issue:
+    return Issue(code, "error", clause, message, remedy)
+
+
+def _word(code: str, clause: str, message: str, remedy: str) -> Issue:
+    return Issue(code, "information", clause, message, remedy)
+
+
 _ALL = (
-    Issue("RDM001", "error", "2", "the file cannot be read", "check the path and its permissions"),
-    Issue("RDM101", "error", "3.1", "the file ends inside its header", _DAMAGED),
-    Issue(
-        "RDM102", "error", "3.1", "this is no ReduceM scene file", "give a .rdm file that striptools wrote"
-    ),
-    Issue(
-        "RDM103", "error", "5", "the format version is not read here", "convert the model again, or update"
-    ),
-    Issue("RDM104", "error", "3.1", "the file is not as long as its header says", _DAMAGED),
-    Issue(
-        "RDM105", "error", "3.1", "the number of sections is not 1 to 64, or the table does not fit", _DAMAGED
-    ),
-    Issue("RDM106", "error", "3.1", "the checksum of header and section table does not fit", _DAMAGED),
-    Issue("RDM107", "error", "3.2", "a reserved field or flag is not zero", _WRITER),
-    Issue("RDM108", "error", "3.3", "padding is not zero", _DAMAGED),
-    Issue("RDM109", "error", "3.3", "a section is empty or out of its place", _WRITER),
-    Issue("RDM110", "error", "3.2", "the checksum of a section does not fit", _DAMAGED),
-    Issue("RDM111", "error", "3.2", "an unknown section must be understood", "update striptools"),
-    Issue("RDM112", "error", "3.2", "a kind of section is there twice", _WRITER),
-    Issue("RDM113", "error", "4", "a section is missing", _WRITER),
-    Issue("RDM114", "error", "4", "a section is not as long as the counts say", _WRITER),
-    Issue("RDM115", "information", "3.2", "an unknown section is passed over", "update striptools"),
-    Issue("RDM116", "error", "4", "a section's must-understand flag is not the one of its kind", _WRITER),
-    Issue("RDM201", "error", "4.1", "a count is out of its range", _WRITER),
-    Issue("RDM202", "error", "4.1", "the error bound is negative or not finite", _WRITER),
-    Issue("RDM301", "error", "4.2", "a position is not finite", _WRITER),
-    Issue("RDM302", "error", "4.5", "strip starts do not rise from 0 to the number of triangles", _WRITER),
-    Issue("RDM303", "error", "4.4", "the first triangle of a strip has a turn", _WRITER),
-    Issue("RDM304", "error", "4.4", "a turn bit past the last triangle is set", _WRITER),
-    Issue("RDM305", "error", "4.3", "a strip vertex names no position", _WRITER),
-    Issue("RDM306", "error", "4.3", "positions are not in the order of their first use", _WRITER),
-    Issue("RDM307", "error", "4.3", "a position is used by no strip", _WRITER),
-    Issue("RDM308", "error", "4.3", "a triangle names one position twice", _WRITER),
-    Issue("RDM401", "error", "4.6", "a node of the hierarchy has an empty child", _WRITER),
-    Issue("RDM402", "error", "4.6", "a box of the hierarchy is not finite", _WRITER),
-    Issue("RDM403", "error", "4.6", "a box of the hierarchy does not hold what is below it", _WRITER),
-    Issue("RDM501", "error", "4.7", "a rotation is not 0, 1 or 2", _WRITER),
-    Issue("RDM502", "error", "4.7", "a triangle comes from a face that the source does not have", _WRITER),
-    Issue("RDM503", "error", "4.7", "two triangles come from one source face", _WRITER),
+    _flaw("RDM001", "2", "the file cannot be read", "check the path and its permissions"),
+    _flaw("RDM101", "3.1", "the file ends inside its header", _DAMAGED),
+    _flaw("RDM102", "3.1", "this is no ReduceM scene file", "give a .rdm file that striptools wrote"),
+    _flaw("RDM103", "7", "the format version is not read here", "convert the model again, or update"),
+    _flaw("RDM104", "3.1", "the file is not as long as its header says", _DAMAGED),
+    _flaw("RDM105", "3.1", "the number of sections is not 1 to 64, or the table does not fit", _DAMAGED),
+    _flaw("RDM106", "3.1", "the checksum of header and section table does not fit", _DAMAGED),
+    _flaw("RDM107", "1", "a reserved field or bit is not zero"),
+    _flaw("RDM108", "3.3", "padding is not zero", _DAMAGED),
+    _flaw("RDM109", "3.3", "a section is empty or out of its place"),
+    _flaw("RDM110", "3.2", "the checksum of a section's stored bytes does not fit", _DAMAGED),
+    _flaw("RDM111", "3.2", "an unknown section must be understood", _UPDATE),
+    _flaw("RDM112", "3.2", "a kind of section is there twice"),
+    _flaw("RDM113", "4", "a section is missing"),
+    _flaw("RDM114", "4", "a section is not as long as the counts say"),
+    _word("RDM115", "3.2", "an unknown section is passed over", _UPDATE),
+    _flaw("RDM116", "3.2", "a section's must-understand flag is not the one of its kind"),
+    _flaw("RDM117", "4", "a section is there that the scene does not need"),
+    _flaw("RDM118", "3.2", "a raw section has two lengths or two checksums"),
+    _flaw("RDM119", "6", "the codec of a section is not known", _UPDATE),
+    _flaw("RDM120", "6", "the scene record is not raw"),
+    _flaw("RDM121", "6", "the stored bytes of a section do not decode to its raw length", _DAMAGED),
+    _flaw("RDM122", "3.2", "the checksum of a section's decoded bytes does not fit", _DAMAGED),
+    _word("RDM123", "6", "a section is passed over: its codec is not installed", "install the extra archive"),
+    _flaw("RDM124", "8", "the scene is larger than this program can hold", "split the model"),
+    _flaw("RDM201", "4.1", "a count is out of its range, or disagrees with another one"),
+    _flaw("RDM202", "4.1", "the error bound is negative or not finite"),
+    _flaw("RDM203", "4.1", "the grid exponent is out of its range, or there without a grid"),
+    _flaw("RDM204", "4.1", "a coordinate does not lie on the grid"),
+    _flaw("RDM205", "4.1", "low and high are not the bounds of the positions"),
+    _flaw("RDM206", "4.1", "the exponent of a cell is out of its range"),
+    _flaw("RDM207", "4.1", "the longest run is not 1 to 8, or not 0 where boxes are not stored"),
+    _flaw("RDM208", "4.1", "a field of an empty scene is not zero"),
+    _flaw("RDM501", "4.6", "a rotation is not 0, 1 or 2"),
+    _flaw("RDM502", "4.6", "a triangle comes from a face that the source does not have"),
+    _flaw("RDM503", "4.6", "two triangles come from one source face"),
+    _flaw("RDM504", "4.6", "an unused bit of the rotations is set"),
+    _flaw("RDM601", "4.2", "a block does not begin at the triangle where the one before it ends"),
+    _flaw("RDM602", "4.2", "the data of a block do not begin where those before them end"),
+    _flaw("RDM603", "4.2", "a block has fewer than 3 vertices, or more strips than triangles"),
+    _flaw("RDM604", "4.2", "the width, mode or exponent of an axis is out of its range"),
+    _flaw("RDM605", "4.2", "an unused bit of the block data is set"),
+    _flaw("RDM606", "4.2", "the block data are longer or shorter than the blocks say"),
+    _flaw("RDM607", "4.3", "the start bits do not begin with a strip, or are not as many as the strips"),
+    _flaw("RDM608", "4.3", "the first triangle of a strip has a turn or a flip"),
+    _flaw("RDM609", "4.3", "flip bits are there, but none is set"),
+    _flaw("RDM610", "4.3", "more than 30 turn bits in a row are equal"),
+    _flaw("RDM611", "4.3", "an index names no vertex of its block"),
+    _flaw("RDM612", "4.3", "the indices are not in the order of their first use"),
+    _flaw("RDM613", "4.3", "a vertex of a block is not used"),
+    _flaw("RDM614", "4.3", "a triangle names one vertex twice"),
+    _flaw("RDM615", "4.3", "a coordinate is not a finite number, or not an exact one"),
+    _flaw("RDM701", "4.4", "an inner child is none of the nodes that it may be"),
+    _flaw("RDM702", "4.4", "a node is not the child of exactly one slot"),
+    _flaw("RDM703", "4.4", "a block is not the leaf of exactly one slot"),
+    _flaw("RDM704", "4.4", "a run is not the leaf of exactly one slot of its block's nodes"),
+    _flaw("RDM705", "4.4", "a slot is neither empty nor a box"),
+    _flaw("RDM706", "4.4", "a node without inner children or without leaves has a first one"),
+    _flaw("RDM707", "4.4", "a box does not hold what is below it"),
+    _flaw("RDM708", "4.4", "a node has no child"),
+    _flaw("RDM801", "4.5", "the runs of a block do not begin where those before them end"),
+    _flaw("RDM802", "4.5", "a run is not in one strip of its block, or longer than the longest run"),
+    _flaw("RDM803", "4.5", "a triangle is not in exactly one run"),
+    _flaw("RDM901", "4.7", "the metadata are no JSON object in UTF-8"),
+    _flaw("RDM902", "4.7", "the metadata are longer than 2^20 bytes"),
+    _flaw("RDM903", "4.7", "generator, source or unit is not a string"),
+    _flaw("RDM904", "4.7", "the metadata are nested deeper than 32 levels"),
 )
 
 ISSUES = {issue.code: issue for issue in _ALL}
@@ -84,3 +127,25 @@ def unreadable(code: str, where: str) -> UnreadableSceneError:
     """Make the error that refuses a scene for one issue."""
     issue = ISSUES[code]
     return UnreadableSceneError(f"{code} {issue.message}", where=where, remedy=issue.remedy)
+
+
+def catalogue() -> str:
+    """The catalogue as Markdown: the whole text of formats/reducem/ISSUES.md."""
+    rows = [f"| {i.code} | {i.severity} | {i.clause} | {i.message} | {i.remedy} |\n" for i in _ALL]
+    return _HEAD + "".join(rows)
+
+
+_HEAD = """\
+# Issues of a ReduceM scene file
+
+What `striptools.reducem.validate` finds and what the reader refuses. A file is valid when it has no issue of
+severity `error`. The clause is the section of SPEC.md that rules the flaw out. Codes are never used again for
+something else; those from RDM301 to RDM499 were of formats before 0.3. `python -m striptools.reducem.issues`
+prints this file, and a test compares the two.
+
+| code | severity | clause | message | remedy |
+|---|---|---|---|---|
+"""
+
+if __name__ == "__main__":
+    sys.stdout.write(catalogue())

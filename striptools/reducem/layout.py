@@ -8,14 +8,44 @@ from dataclasses import dataclass
 import numpy as np
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-VERSION = (0, 1)
+VERSION = (0, 3)
 ALIGNMENT = 64
 SECTION_LIMIT = 64
-TRIANGLE_LIMIT = 2**29
-SOURCE_FACE_LIMIT = 2**30
 MUST_UNDERSTAND = 1
-ROTATION_SHIFT = 30
-"""A remap word is the source face in its low 30 bits and the rotation in the two above."""
+
+CODEC_RAW = 0
+CODEC_ZSTD = 1
+LARGEST_WINDOW = 27
+"""Two to this many bytes is the largest window of a Zstandard frame."""
+
+BOXES_STORED = 1
+ON_GRID = 2
+"""Bits of the scene record's flags."""
+
+BLOCK_FLIPS = 1
+"""The bit of a block header's flags that says that there are flip bits."""
+
+SOURCE_FACE_LIMIT = 2**32 - 1
+TRIANGLE_LIMIT = 2**32 - 1
+BLOCK_LIMIT = 2**24
+NODE_LIMIT = 2**28
+BLOCK_TRIANGLES = 256
+BLOCK_VERTICES = 256
+LONGEST_RUN = 8
+LONGEST_EQUAL_TURNS = 30
+"""The most equal turn bits in a row within a strip, its first triangle's left out."""
+
+MOST_BLOCK_BYTES = 3936
+LEAST_BLOCK_DATA = 128
+"""A block's data are at most so many bytes; block data are at least, and at most by so many, more."""
+
+ZERO_WORDS = 16
+"""Words of zero after the last block's data."""
+
+GRID_EXPONENTS = range(-149, 105)
+CELL_EXPONENTS = range(-149, 128)
+METADATA_LIMIT = 2**20
+METADATA_NAMES = ("generator", "source", "unit")
 
 
 @dataclass(frozen=True)
@@ -48,59 +78,124 @@ class Record:
 
 @dataclass(frozen=True)
 class Section:
-    """A kind of section: its four characters, the part it counts to, and whether it must be understood."""
+    """A kind of section: its four characters, and whether it must be understood."""
 
     kind: bytes
-    part: str
     must_understand: bool
 
 
-HEADER = Record(
-    "file header",
-    (
-        Field(0, 8, "S8", "magic"),
-        Field(8, 2, "<u2", "major"),
-        Field(10, 2, "<u2", "minor"),
-        Field(12, 4, "<u4", "section_count"),
-        Field(16, 8, "<u8", "total_length"),
-        Field(24, 4, "<u4", "reserved"),
-        Field(28, 4, "<u4", "checksum"),
-    ),
-)
-ENTRY = Record(
-    "section entry",
-    (
-        Field(0, 4, "S4", "kind"),
-        Field(4, 4, "<u4", "flags"),
-        Field(8, 8, "<u8", "offset"),
-        Field(16, 8, "<u8", "length"),
-        Field(24, 4, "<u4", "checksum"),
-        Field(28, 4, "<u4", "reserved"),
-    ),
-)
-SCENE_RECORD = Record(
-    "scene record",
-    (
-        Field(0, 4, "<u4", "triangle_count"),
-        Field(4, 4, "<u4", "vertex_count"),
-        Field(8, 4, "<u4", "strip_count"),
-        Field(12, 4, "<u4", "source_face_count"),
-        Field(16, 8, "<f8", "error_bound"),
-    ),
-)
-RECORDS = (HEADER, ENTRY, SCENE_RECORD)
+def _record(name: str, *fields: tuple[str, str]) -> Record:
+    made, offset = [], 0
+    for kind, field in fields:
+        size = np.dtype(kind).itemsize
+        made.append(Field(offset, size, kind, field))
+        offset += size
+    return Record(name, tuple(made))
 
-SCENE = Section(b"SCEN", "headers", True)
-POSITIONS = Section(b"POSN", "positions", True)
-STRIP_VERTICES = Section(b"SVTX", "strip_vertices", True)
-TURNS = Section(b"TURN", "turns", True)
-STRIP_STARTS = Section(b"STRT", "strip_starts", True)
-HIERARCHY = Section(b"HIER", "hierarchy", True)
-REMAP = Section(b"RMAP", "remap", False)
-SECTIONS = (SCENE, POSITIONS, STRIP_VERTICES, TURNS, STRIP_STARTS, HIERARCHY, REMAP)
+
+HEADER = _record(
+    "file header",
+    ("S8", "magic"),
+    ("<u2", "major"),
+    ("<u2", "minor"),
+    ("<u4", "section_count"),
+    ("<u8", "total_length"),
+    ("<u4", "reserved"),
+    ("<u4", "checksum"),
+)
+ENTRY = _record(
+    "section entry",
+    ("S4", "kind"),
+    ("<u2", "flags"),
+    ("<u2", "codec"),
+    ("<u8", "offset"),
+    ("<u8", "stored_length"),
+    ("<u8", "raw_length"),
+    ("<u4", "stored_checksum"),
+    ("<u4", "raw_checksum"),
+)
+SCENE_RECORD = _record(
+    "scene record",
+    ("<u4", "triangle_count"),
+    ("<u4", "block_count"),
+    ("<u4", "node_count"),
+    ("<u4", "top_count"),
+    ("<u4", "run_count"),
+    ("<u4", "source_face_count"),
+    ("u1", "flags"),
+    ("u1", "reserved"),
+    ("<i2", "grid_exponent"),
+    ("<u4", "reserved_2"),
+    ("<f8", "error_bound"),
+    ("<f4", "low_x"),
+    ("<f4", "low_y"),
+    ("<f4", "low_z"),
+    ("<f4", "high_x"),
+    ("<f4", "high_y"),
+    ("<f4", "high_z"),
+    ("<i2", "cell_x"),
+    ("<i2", "cell_y"),
+    ("<i2", "cell_z"),
+    ("<u2", "longest_run"),
+    ("24u1", "reserved_3"),
+)
+BLOCK_HEADER = _record(
+    "block header",
+    ("<u4", "first_triangle"),
+    ("<u4", "word"),
+    ("u1", "triangles"),
+    ("u1", "vertices"),
+    ("u1", "strips"),
+    ("u1", "flags"),
+    ("<i4", "anchor_x"),
+    ("<i4", "anchor_y"),
+    ("<i4", "anchor_z"),
+    ("u1", "axis_x"),
+    ("u1", "axis_y"),
+    ("u1", "axis_z"),
+    ("u1", "exponent_x"),
+    ("u1", "exponent_y"),
+    ("u1", "exponent_z"),
+    ("<u2", "reserved"),
+)
+NODE_RECORD = _record(
+    "node",
+    ("<u4", "base"),
+    ("<u4", "leaves"),
+    ("<u2", "origin_x"),
+    ("<u2", "origin_y"),
+    ("<u2", "origin_z"),
+    ("u1", "inner"),
+    ("u1", "shifts"),
+    ("8u1", "low_x"),
+    ("8u1", "low_y"),
+    ("8u1", "low_z"),
+    ("8u1", "high_x"),
+    ("8u1", "high_y"),
+    ("8u1", "high_z"),
+)
+RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD)
+
+SCENE = Section(b"SCEN", True)
+BLOCK_HEADERS = Section(b"BLKH", True)
+BLOCK_DATA = Section(b"BLKD", True)
+NODES = Section(b"NODE", True)
+RUNS = Section(b"RUNS", True)
+REMAP = Section(b"RMAP", False)
+METADATA = Section(b"META", False)
+SECTIONS = (SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, METADATA)
 """In the order in which the writer puts them."""
 
-PARTS = ("positions", "strip_vertices", "turns", "strip_starts", "hierarchy", "remap", "headers")
+PARTS = (
+    "positions",
+    "connectivity",
+    "in_block_hierarchy",
+    "block_headers",
+    "top_level",
+    "remap",
+    "container",
+)
+"""What the bytes of a file are counted by; container is header, table, scene record, metadata and padding."""
 
 
 def aligned(length: int) -> int:
@@ -108,14 +203,22 @@ def aligned(length: int) -> int:
     return -(-length // ALIGNMENT) * ALIGNMENT
 
 
-def section_lengths(triangles: int, vertices: int, strips: int, *, remap: bool) -> dict[bytes, int]:
-    """Say how long each section of a scene is; a section of no bytes is left out of the file."""
+def remap_length(triangles: int) -> int:
+    """Bytes of the remap of so many triangles."""
+    return 4 * triangles + -(-triangles // 4)
+
+
+def section_lengths(
+    triangles: int, blocks: int, nodes: int, runs: int, *, boxes_stored: bool
+) -> dict[bytes, int]:
+    """Say how long each section of a scene is, decoded, where its counts alone say so; 0 means left out.
+
+    Block data, metadata, and whether there is a remap are not the counts' matter.
+    """
     return {
         SCENE.kind: SCENE_RECORD.size,
-        POSITIONS.kind: 12 * vertices,
-        STRIP_VERTICES.kind: 4 * (triangles + 2 * strips),
-        TURNS.kind: (triangles + 7) // 8,
-        STRIP_STARTS.kind: 4 * (strips + 1),
-        HIERARCHY.kind: 28 * (strips - 1),
-        REMAP.kind: 4 * triangles if remap else 0,
+        BLOCK_HEADERS.kind: BLOCK_HEADER.size * blocks,
+        NODES.kind: NODE_RECORD.size * nodes,
+        RUNS.kind: 4 * blocks + 2 * runs if boxes_stored else 0,
+        REMAP.kind: remap_length(triangles),
     }

@@ -1,30 +1,49 @@
 """Read a scene file, or refuse it with one line; formats/reducem/SPEC.md is what it reads by.
 
-A stream is read in pieces and never past one byte more than its header declares, so that memory is bounded by
-the bytes that are really there: no count is believed that the file's length does not bear out.
+A file is mapped and a stream is read, in pieces and never past one byte more than its header declares, so
+that memory is bounded by the bytes that are really there: no count is believed that the file's length does
+not bear out. Opening looks at the header and the section table. A section is looked at when it is first
+asked for: its padding and checksums, its length by the counts, then the rules of what it holds.
+`read_scene` asks for all.
 """
 
 import io
+import json
+import mmap
+import os
+import re
+import stat
 import zlib
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
-from striptools.hierarchies.strip_bvh import StripHierarchy
-from striptools.reducem import layout
-from striptools.reducem.check import check_scene
+from striptools.hierarchies.packed import BoxGrid, PackedNodes
+from striptools.reducem import check, layout
+from striptools.reducem.archive import expanded
+from striptools.reducem.blocks import Blocks, check_headers
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene
 
-__all__ = ["PIECE", "read_scene"]
+__all__ = ["PIECE", "open_scene", "read_scene"]
 
 PIECE = 1 << 20
 """Bytes asked of a stream at once."""
 
+MOST_TRIANGLES = (2**31 - 1) // 3
+"""Strip vertices, at most three a triangle, are numbered in int32 here."""
 
-def read_scene(source: str | Path | bytes | bytearray | memoryview | IO[bytes]) -> Scene:
-    """Read a scene file.
+LEVELS = 32
+"""How deep metadata may be nested."""
+
+Source = str | Path | bytes | bytearray | memoryview | IO[bytes]
+
+
+def read_scene(source: Source) -> Scene:
+    """Read a scene file and check all of it.
 
     Args:
         source: A path, the file's bytes, or a binary stream of it, which must end where the file does.
@@ -35,23 +54,53 @@ def read_scene(source: str | Path | bytes | bytearray | memoryview | IO[bytes]) 
     Raises:
         UnreadableSceneError: The file cannot be read or is no valid scene file; the line gives the
             place and an issue's code (formats/reducem/ISSUES.md).
+        MissingExtraError: It is an archive, and its codec is not installed.
+    """
+    scene = open_scene(source)
+    scene.check()
+    return scene
+
+
+def open_scene(source: Source) -> Scene:
+    """Open a scene file: header and section table are checked now, all else when it is first asked for.
+
+    Args:
+        source: As for `read_scene`. A file is mapped, and must not be changed in place while the scene is
+            used; a stream is read whole.
+
+    Returns:
+        A scene whose fields and methods may raise what `read_scene` raises; `scene.check()` checks all.
+
+    Raises:
+        UnreadableSceneError: The file cannot be read, or its header or section table is not valid.
     """
     if isinstance(source, bytes | bytearray | memoryview):
-        return _decode(_gather(io.BytesIO(source), "scene"), "scene")
+        return _File(_gather(io.BytesIO(source), "scene"), "scene").scene()
     if not isinstance(source, str | Path):
         where = str(getattr(source, "name", "the input stream"))
-        return _decode(_gather(source, where), where)
+        return _File(_gather(source, where), where).scene()
     where = str(source)
     try:
         with Path(source).open("rb") as file:
-            data = _gather(file, where)
+            view = _mapped(file) or _gather(file, where)
     except (OSError, ValueError) as error:
         raise unreadable("RDM001", where) from error
-    return _decode(data, where)
+    return _File(view, where).scene()
 
 
-def _gather(stream: IO[bytes], where: str) -> bytearray:
-    # A bytearray, because kernels would be compiled a second time for read-only arrays.
+def _mapped(file: IO[bytes]) -> memoryview | None:
+    """The bytes of a regular file, or None for what cannot be mapped.
+
+    The mapping is private and may be written to, because kernels would be compiled a second time for arrays
+    that may not.
+    """
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode) or status.st_size < layout.HEADER.size:
+        return None
+    return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
+
+
+def _gather(stream: IO[bytes], where: str) -> memoryview:
     data = bytearray()
     wanted = layout.HEADER.size
     header_seen = False
@@ -65,150 +114,308 @@ def _gather(stream: IO[bytes], where: str) -> bytearray:
         data += piece
         if len(data) >= layout.HEADER.size and not header_seen:
             header_seen = True
-            wanted = int(_header(data, where)["total_length"]) + 1
-    return data
+            wanted = int(_header(memoryview(data), where)["total_length"]) + 1
+    return memoryview(data)
 
 
-def _header(data: bytearray, where: str) -> np.void:
-    if len(data) < layout.HEADER.size:
-        whole_magic = bytes(data[: len(layout.MAGIC)]) == layout.MAGIC[: len(data)]
-        raise unreadable("RDM101" if whole_magic else "RDM102", where)
-    if bytes(data[: len(layout.MAGIC)]) != layout.MAGIC:
+def _header(data: memoryview, where: str) -> np.void:
+    if bytes(data[: len(layout.MAGIC)]) != layout.MAGIC[: len(data)]:
         raise unreadable("RDM102", where)
+    if len(data) < layout.HEADER.size:
+        raise unreadable("RDM101", where)
     header = np.frombuffer(bytes(data[: layout.HEADER.size]), layout.HEADER.dtype)[0]
     if (int(header["major"]), int(header["minor"])) != layout.VERSION:
         raise unreadable("RDM103", f"{where}: version {header['major']}.{header['minor']}")
     return header
 
 
-def _decode(data: bytearray, where: str) -> Scene:
-    sections = _sections(data, where)
-    scene = _scene(sections, where)
-    check_scene(scene, where)
-    return scene
+@dataclass(frozen=True)
+class _Entry:
+    """A row of the section table, the end of the section before it, and its place for errors."""
+
+    kind: bytes
+    before: int
+    place: str
+    flags: int
+    codec: int
+    offset: int
+    stored_length: int
+    raw_length: int
+    stored_checksum: int
+    raw_checksum: int
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.stored_length
 
 
-def _sections(data: bytearray, where: str) -> dict[bytes, memoryview]:
-    header = _header(data, where)
-    if len(data) != int(header["total_length"]):
+class _File:
+    """A scene file's bytes and its section table, checked; and the way from its sections to a scene."""
+
+    def __init__(self, view: memoryview, where: str) -> None:
+        self.view, self.where = view, where
+        self.entries = _table(view, where)
+
+    def scene(self) -> Scene:
+        scene = Scene.lazily(self.load, self.check)
+        scene.__dict__["_where"] = self.where
+        return scene
+
+    def load(self, name: str, scene: Scene) -> object:
+        """A field of the scene, checked."""
+        if name == "blocks":
+            return self.blocks()
+        if name == "packed":
+            return self.packed(scene)
+        if name == "remap":
+            return self.remap()
+        if name == "metadata":
+            return self.metadata()
+        return self.of_record(name)
+
+    def check(self, scene: Scene) -> None:
+        """Check all: the sections, those that are passed over too, and what they hold."""
+        for entry in self.entries.values():
+            self.stored(entry)
+        check.check_scene(scene, self.where)
+
+    def stored(self, entry: _Entry) -> memoryview:
+        """The stored bytes of a section, it and the padding on both its sides checked."""
+        for start, end in ((entry.before, entry.offset), (entry.end, layout.aligned(entry.end))):
+            if any(self.view[start:end]):
+                raise unreadable("RDM108", entry.place)
+        payload = self.view[entry.offset : entry.end]
+        if zlib.crc32(payload) != entry.stored_checksum:
+            raise unreadable("RDM110", entry.place)
+        return payload
+
+    def section(self, section: layout.Section, least: int, most: int | None = None) -> np.ndarray:
+        """The decoded bytes of a section, uint8; none where it is not there and need not be.
+
+        Args:
+            section: Which.
+            least: The bytes that it must have by the counts; 0 where it must not be there.
+            most: The most bytes, where it is not the least that it must have; such a section may be missing.
+        """
+        entry = self.entries.get(section.kind)
+        place = f"{self.where}: {section.kind.decode()}"
+        most = least if most is None else most
+        if entry is None:
+            if least:
+                raise unreadable("RDM113", place)
+            return np.zeros(0, np.uint8)
+        if most == 0:
+            raise unreadable("RDM117", place)
+        if not least <= entry.raw_length <= most:
+            raise unreadable("RDM902" if section is layout.METADATA else "RDM114", place)
+        payload = self.stored(entry)
+        if entry.codec == layout.CODEC_RAW:
+            return np.frombuffer(payload, np.uint8)
+        raw = expanded(payload, entry.raw_length, place)
+        if zlib.crc32(raw) != entry.raw_checksum:
+            raise unreadable("RDM122", place)
+        return raw
+
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """The scene record, the ranges of its fields checked."""
+        raw = self.section(layout.SCENE, layout.SCENE_RECORD.size)
+        row = np.frombuffer(raw.tobytes(), layout.SCENE_RECORD.dtype)[0]
+        record = {name: row[name].tolist() for name in layout.SCENE_RECORD.dtype.names or ()}
+        _check_record(record, f"{self.where}: SCEN")
+        if record["triangle_count"] > MOST_TRIANGLES or record["source_face_count"] > 2**31 - 1:
+            raise unreadable("RDM124", f"{self.where}: SCEN")
+        return record
+
+    def of_record(self, name: str) -> object:
+        """A field of the scene that is in its record."""
+        record = self.record
+        triple = {key: [record[f"{key}_{axis}"] for axis in "xyz"] for key in ("low", "high", "cell")}
+        low, high = np.array(triple["low"], np.float32), np.array(triple["high"], np.float32)
+        fields: dict[str, object] = {
+            "grid": BoxGrid(low, np.array(triple["cell"], np.int32)),
+            "low": low,
+            "high": high,
+            "grid_exponent": record["grid_exponent"] if record["flags"] & layout.ON_GRID else None,
+            "error_bound": record["error_bound"],
+            "source_face_count": record["source_face_count"],
+        }
+        return fields[name]
+
+    def blocks(self) -> Blocks:
+        """The blocks, their headers checked."""
+        count = self.record["block_count"]
+        headers = self.section(layout.BLOCK_HEADERS, layout.BLOCK_HEADER.size * count)
+        most = layout.MOST_BLOCK_BYTES * count + layout.LEAST_BLOCK_DATA if count else 0
+        words = self.section(layout.BLOCK_DATA, layout.LEAST_BLOCK_DATA if count else 0, most)
+        if len(words) % 4:
+            raise unreadable("RDM606", f"{self.where}: BLKD")
+        blocks = Blocks(_array(headers, "<u4", np.uint32).reshape(-1, 8), _array(words, "<u4", np.uint32))
+        if count:
+            check_headers(blocks, self.record["triangle_count"], self.where)
+        return blocks
+
+    def packed(self, scene: Scene) -> PackedNodes:
+        """The hierarchy, checked against the decoded blocks."""
+        record, runs = self.record, None
+        first_run = None
+        nodes = self.section(layout.NODES, layout.NODE_RECORD.size * record["node_count"])
+        blocks, run_count = record["block_count"], record["run_count"]
+        stored = bool(record["flags"] & layout.BOXES_STORED)
+        rest = self.section(layout.RUNS, 4 * blocks + 2 * run_count if stored else 0)
+        if stored:
+            first_run = _array(rest[: 4 * blocks], "<u4", np.uint32)
+            runs = _array(rest[4 * blocks :], "<u2", np.uint16)
+        words = _array(nodes, "<u4", np.uint32).reshape(-1, 16)
+        packed = PackedNodes(words, record["top_count"], first_run, runs, record["longest_run"])
+        scene.__dict__["packed"] = packed
+        try:
+            check.check_nodes(scene, self.where)
+        except BaseException:
+            del scene.__dict__["packed"]
+            raise
+        return packed
+
+    def remap(self) -> Remap | None:
+        """The remap, checked."""
+        count, faces = self.record["triangle_count"], self.record["source_face_count"]
+        length = layout.remap_length(count)
+        if layout.REMAP.kind not in self.entries:
+            return None
+        raw = self.section(layout.REMAP, length)
+        packed = raw[4 * count :]
+        rotation = np.stack([packed & 3, packed >> 2 & 3, packed >> 4 & 3, packed >> 6], axis=1).reshape(-1)
+        if rotation[count:].any():
+            raise unreadable("RDM504", f"{self.where}: RMAP")
+        remap = Remap(_array(raw[: 4 * count], "<i4", np.int32), np.ascontiguousarray(rotation[:count]))
+        check.check_remap(remap, count, faces, self.where)
+        return remap
+
+    def metadata(self) -> dict[str, Any]:
+        """The metadata, checked."""
+        raw = self.section(layout.METADATA, 0, layout.METADATA_LIMIT)
+        if not len(raw):
+            return {}
+        place = f"{self.where}: META"
+        try:
+            text = raw.tobytes().decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise unreadable("RDM901", place) from error
+        if _levels(text) > LEVELS:
+            raise unreadable("RDM904", place)
+        try:
+            metadata = json.loads(text, parse_int=_integer, parse_constant=_no_number)
+        except ValueError as error:
+            raise unreadable("RDM901", place) from error
+        check.check_metadata(metadata, self.where)
+        return metadata
+
+
+def _table(view: memoryview, where: str) -> dict[bytes, _Entry]:
+    """The sections by their kinds, all that the table alone tells checked."""
+    header = _header(view, where)
+    if len(view) != int(header["total_length"]):
         raise unreadable("RDM104", where)
     count = int(header["section_count"])
-    table_end = layout.HEADER.size + count * layout.ENTRY.size
-    if not 1 <= count <= layout.SECTION_LIMIT or table_end > len(data):
+    end = layout.HEADER.size + count * layout.ENTRY.size
+    if not 1 <= count <= layout.SECTION_LIMIT or end > len(view):
         raise unreadable("RDM105", where)
-    view = memoryview(data)
-    checksum = zlib.crc32(view[layout.HEADER.size : table_end], zlib.crc32(view[: layout.HEADER.size - 4]))
+    checksum = zlib.crc32(view[layout.HEADER.size : end], zlib.crc32(view[: layout.HEADER.size - 4]))
     if checksum != int(header["checksum"]):
         raise unreadable("RDM106", where)
     if header["reserved"]:
         raise unreadable("RDM107", where)
-    table = np.frombuffer(bytes(view[layout.HEADER.size : table_end]), layout.ENTRY.dtype)
-    return _cut(view, table, table_end, where)
-
-
-def _cut(view: memoryview, table: np.ndarray, end: int, where: str) -> dict[bytes, memoryview]:
-    known = {section.kind: section for section in layout.SECTIONS}
-    seen: set[bytes] = set()
-    sections: dict[bytes, memoryview] = {}
-    for entry in table:
-        kind, place = _kind(entry, where)
-        if kind in seen:
-            raise unreadable("RDM112", place)
-        seen.add(kind)
-        end = _check_place(view, entry, end, place)
-        _check_flags(entry, known.get(kind), place)
-        payload = view[int(entry["offset"]) : end]
-        if zlib.crc32(payload) != int(entry["checksum"]):
-            raise unreadable("RDM110", place)
-        if kind in known:
-            sections[kind] = payload
+    entries: dict[bytes, _Entry] = {}
+    for row in np.frombuffer(bytes(view[layout.HEADER.size : end]), layout.ENTRY.dtype):
+        entry = _entry(row, end, where)
+        if entry.stored_length == 0 or entry.raw_length == 0:
+            raise unreadable("RDM109", entry.place)
+        if entry.offset != layout.aligned(end) or entry.end > len(view):
+            raise unreadable("RDM109", entry.place)
+        if entry.kind in entries:
+            raise unreadable("RDM112", entry.place)
+        _check_entry(entry)
+        entries[entry.kind] = entry
+        end = entry.end
     if layout.aligned(end) != len(view):
         raise unreadable("RDM104", where)
-    _check_padding(view, end, len(view), where)
-    return sections
+    return entries
 
 
-def _kind(entry: np.void, where: str) -> tuple[bytes, str]:
+def _entry(row: np.void, before: int, where: str) -> _Entry:
     # NumPy drops trailing zero bytes of a string; a kind keeps its four.
-    kind = bytes(entry["kind"]).ljust(4, b"\0")
-    return kind, f"{where}: {kind.decode('ascii', 'backslashreplace')}"
+    kind = bytes(row["kind"]).ljust(4, b"\0")
+    rest = [int(row[field.name]) for field in layout.ENTRY.fields[1:]]
+    return _Entry(kind, before, f"{where}: {kind.decode('ascii', 'backslashreplace')}", *rest)
 
 
-def _check_place(view: memoryview, entry: np.void, end: int, place: str) -> int:
-    offset, length = int(entry["offset"]), int(entry["length"])
-    if offset != layout.aligned(end) or length == 0 or offset + length > len(view):
-        raise unreadable("RDM109", place)
-    _check_padding(view, end, offset, place)
-    return offset + length
+def _check_entry(entry: _Entry) -> None:
+    section = _KNOWN.get(entry.kind)
+    if entry.flags & ~layout.MUST_UNDERSTAND:
+        raise unreadable("RDM107", entry.place)
+    if section is None and entry.flags:
+        raise unreadable("RDM111", entry.place)
+    if section is not None and bool(entry.flags) != section.must_understand:
+        raise unreadable("RDM116", entry.place)
+    stored = (entry.stored_length, entry.stored_checksum)
+    if entry.codec == layout.CODEC_RAW and stored != (entry.raw_length, entry.raw_checksum):
+        raise unreadable("RDM118", entry.place)
+    if section is not None and entry.codec not in (layout.CODEC_RAW, layout.CODEC_ZSTD):
+        raise unreadable("RDM119", entry.place)
+    if section is layout.SCENE and entry.codec != layout.CODEC_RAW:
+        raise unreadable("RDM120", entry.place)
 
 
-def _check_padding(view: memoryview, start: int, stop: int, place: str) -> None:
-    if any(view[start:stop]):
-        raise unreadable("RDM108", place)
+_KNOWN = {section.kind: section for section in layout.SECTIONS}
 
 
-def _check_flags(entry: np.void, section: layout.Section | None, place: str) -> None:
-    flags = int(entry["flags"])
-    if flags & ~layout.MUST_UNDERSTAND or entry["reserved"]:
+def _check_record(record: dict[str, Any], place: str) -> None:
+    """Make sure that the counts agree with each other; the numbers are looked at with the scene's fields."""
+    names = ("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count")
+    n, b, m, top, r, faces = (record[name] for name in names)
+    stored = record["flags"] & layout.BOXES_STORED
+    if record["flags"] > 3 or record["reserved"] or record["reserved_2"] or any(record["reserved_3"]):
         raise unreadable("RDM107", place)
-    if section is None and flags:
-        raise unreadable("RDM111", place)
-    if section is not None and bool(flags) != section.must_understand:
-        raise unreadable("RDM116", place)
+    if n == 0 and (
+        stored or any(record[f"{key}_{axis}"] for key in ("low", "high", "cell") for axis in "xyz")
+    ):
+        raise unreadable("RDM208", place)
+    nodes = m >= top + b if stored else m == top
+    counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b
+    runs = b <= r <= n if stored else r == 0
+    if not (counts and m <= layout.NODE_LIMIT and nodes and (top == 0) == (b < 2) and runs and faces >= n):
+        raise unreadable("RDM201", place)
+    if not record["flags"] & layout.ON_GRID and record["grid_exponent"]:
+        raise unreadable("RDM203", place)
+    if not (1 <= record["longest_run"] <= layout.LONGEST_RUN if stored else record["longest_run"] == 0):
+        raise unreadable("RDM207", place)
+    if record["flags"] & layout.ON_GRID and record["grid_exponent"] not in layout.GRID_EXPONENTS:
+        raise unreadable("RDM203", place)
+    if not (np.isfinite(record["error_bound"]) and record["error_bound"] >= 0.0):
+        raise unreadable("RDM202", place)
+    if not all(np.isfinite(record[f"{key}_{axis}"]) for key in ("low", "high") for axis in "xyz"):
+        raise unreadable("RDM205", place)
+    if not all(record[f"cell_{axis}"] in layout.CELL_EXPONENTS for axis in "xyz"):
+        raise unreadable("RDM206", place)
 
 
-def _scene(sections: dict[bytes, memoryview], where: str) -> Scene:
-    record = _record(sections, where)
-    triangles, vertices, strips = (
-        int(record[name]) for name in ("triangle_count", "vertex_count", "strip_count")
-    )
-    corners = triangles + 2 * strips
-    if not (1 <= strips <= triangles <= layout.TRIANGLE_LIMIT and 3 <= vertices <= corners):
-        raise unreadable("RDM201", f"{where}: SCEN")
-    has_remap = layout.REMAP.kind in sections
-    lengths = layout.section_lengths(triangles, vertices, strips, remap=has_remap)
-    for kind, length in lengths.items():
-        _check_length(kind, length, len(sections.get(kind, b"")), where)
-    boxes_end = 24 * (strips - 1)
-    hierarchy = sections.get(layout.HIERARCHY.kind, memoryview(bytearray()))
-    return Scene(
-        positions=_array(sections[layout.POSITIONS.kind], "<f4", np.float32).reshape(-1, 3),
-        vertices=_array(sections[layout.STRIP_VERTICES.kind], "<i4", np.int32),
-        turns=_turns(sections[layout.TURNS.kind], triangles, where),
-        starts=_array(sections[layout.STRIP_STARTS.kind], "<i4", np.int32),
-        hierarchy=StripHierarchy(
-            _array(hierarchy[:boxes_end], "<f4", np.float32).reshape(-1, 6),
-            _array(hierarchy[boxes_end:], "<u4", np.uint32),
-        ),
-        remap=_remap(sections[layout.REMAP.kind]) if has_remap else None,
-        error_bound=float(record["error_bound"]),
-        source_face_count=int(record["source_face_count"]),
-    )
+def _array(payload: np.ndarray, stored: str, native: type) -> np.ndarray:
+    return payload.view(stored).astype(native, copy=False)
 
 
-def _record(sections: dict[bytes, memoryview], where: str) -> np.void:
-    payload = sections.get(layout.SCENE.kind, memoryview(b""))
-    _check_length(layout.SCENE.kind, layout.SCENE_RECORD.size, len(payload), where)
-    return np.frombuffer(payload, layout.SCENE_RECORD.dtype)[0]
+def _levels(text: str) -> int:
+    """How deep arrays and objects are nested; brackets in strings do not count."""
+    depth = deepest = 0
+    for token in re.finditer(r'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', text, re.DOTALL):
+        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token[0], 0)
+        deepest = max(deepest, depth)
+    return deepest
 
 
-def _check_length(kind: bytes, wanted: int, found: int, where: str) -> None:
-    if wanted != found:
-        raise unreadable("RDM114" if found else "RDM113", f"{where}: {kind.decode()}")
+def _integer(digits: str) -> int | str:
+    # Python refuses to read more than 4,300 digits, JSON does not.
+    return int(digits) if len(digits) < 4000 else digits
 
 
-def _array(payload: memoryview, stored: str, native: type) -> np.ndarray:
-    return np.frombuffer(payload, stored).astype(native, copy=False)
-
-
-def _turns(payload: memoryview, triangles: int, where: str) -> np.ndarray:
-    bits = np.unpackbits(np.frombuffer(payload, np.uint8), bitorder="little").view(np.bool_)
-    if bits[triangles:].any():
-        raise unreadable("RDM304", f"{where}: TURN")
-    return bits[:triangles]
-
-
-def _remap(payload: memoryview) -> Remap:
-    words = _array(payload, "<u4", np.uint32)
-    face = (words & np.uint32((1 << layout.ROTATION_SHIFT) - 1)).astype(np.int32)
-    return Remap(face, (words >> np.uint32(layout.ROTATION_SHIFT)).astype(np.uint8))
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")

@@ -1,21 +1,26 @@
-"""A ReduceM scene: the arrays of a scene file, exactly as stored, and the ways into and out of it."""
+"""A ReduceM scene: blocks under a hierarchy as they lie in a scene file, and the ways in and out."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from striptools.hierarchies.strip_bvh import StripHierarchy
+from striptools.hierarchies.packed import BoxGrid, PackedNodes, box_grid, build_inner
+from striptools.mesh.clean import weld_vertices
 from striptools.mesh.mesh import Mesh
+from striptools.partition.boxes import face_boxes
+from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, encode_blocks
+from striptools.reducem.layout import LONGEST_RUN
 from striptools.strips.topology import Strips, decode_strips
-from striptools.threads import in_chunks
-from striptools.types import Bools, Counts, FaceIds, Faces, Positions, Rotations
+from striptools.threads import every_core, in_chunks
+from striptools.types import Bools, Boxes, Counts, FaceIds, Faces, Positions, Rotations
 
-if TYPE_CHECKING:
-    from striptools.reducem.writer import SectionSizes
+__all__ = ["BoxesKind", "Remap", "Scene", "empty_scene", "scene_from_strips"]
 
-__all__ = ["Remap", "Scene", "scene_from_strips"]
+BoxesKind = Literal["rebuilt", "stored"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,160 +39,313 @@ class Remap:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Strips of triangles under a hierarchy; the arrays are those of the file and must not be changed.
+    """Blocks of packed strips under a hierarchy; the arrays are those of the file and must not be changed.
 
-    Strip i covers triangles starts[i]:starts[i+1] and strip vertices starts[i]+2i : starts[i+1]+2i+2; how
-    they become triangles is told in `strips.topology`. Vertices stand in the order of their first use by the
-    strips.
+    What the blocks hold is decoded on first use and kept. A vertex that several blocks use stands once for
+    each of them. Strip i covers triangles starts[i]:starts[i+1] and strip vertices starts[i]+2i :
+    starts[i+1]+2i+2; how they become triangles is told in `strips.topology`.
 
     Attributes:
-        positions: (v, 3) float32 in the model's unit, bit for bit those of the cleaned source.
-        vertices: (n+2s,) int32 vertex of each strip vertex.
-        turns: (n,) bool, the turn of each triangle; False for the first of a strip.
-        starts: (s+1,) int32, the first triangle of each strip, then n.
-        hierarchy: Over the strips.
-        remap: The source's faces, or None where it was left out.
+        blocks: The geometry.
+        packed: The hierarchy: over blocks alone, or complete where boxes are stored.
+        grid: Where the planes of its boxes may be.
+        low: (3,) float32, the least coordinates of all positions, never -0.0; zeros without a triangle.
+        high: (3,) float32, the largest.
+        grid_exponent: All coordinates are multiples of 2 to this power; None where nobody asked for a grid.
         error_bound: How far a position may be from the source's, in the model's unit; 0.0 where none moved.
         source_face_count: Faces of the source mesh, before cleaning.
+        remap: The source's faces, or None where it was left out.
+        metadata: For people and tools: a JSON object.
     """
 
-    positions: Positions
-    vertices: Counts
-    turns: Bools
-    starts: Counts
-    hierarchy: StripHierarchy
-    remap: Remap | None
+    blocks: Blocks
+    packed: PackedNodes
+    grid: BoxGrid
+    low: np.ndarray
+    high: np.ndarray
+    grid_exponent: int | None
     error_bound: float
     source_face_count: int
+    remap: Remap | None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def lazily(cls, load: Callable[[str, "Scene"], object], check: Callable[["Scene"], None]) -> "Scene":
+        """A scene whose fields are asked of `load(name, scene)` on first use, and kept.
+
+        Args:
+            load: Gives a field, checked.
+            check: Raises unless every rule of the format is kept.
+        """
+        scene = object.__new__(cls)
+        scene.__dict__.update(_load=load, _check=check)
+        return scene
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            load = self.__dict__.get("_load")
+            if load is None or name not in _FIELDS:
+                raise AttributeError(f"a scene has no {name!r}")
+            return self.__dict__.setdefault(name, load(name, self))
 
     @property
     def triangle_count(self) -> int:
-        """Triangles in all strips."""
-        return len(self.turns)
+        """Triangles in all blocks."""
+        return self.blocks.triangle_count
+
+    @property
+    def block_count(self) -> int:
+        """Blocks."""
+        return self.blocks.count
 
     @property
     def vertex_count(self) -> int:
-        """Vertices, each stored once."""
-        return len(self.positions)
+        """Vertices of all blocks: one that several blocks use counts once for each of them."""
+        return self._totals["vertices"]
 
     @property
     def strip_count(self) -> int:
-        """Strips, the leaves of the stored hierarchy."""
-        return len(self.starts) - 1
+        """Strips in all blocks."""
+        return self._totals["strips"]
+
+    @property
+    def boxes(self) -> BoxesKind:
+        """Whether the boxes inside blocks are stored, or rebuilt when they are needed."""
+        return "rebuilt" if self.packed.runs is None else "stored"
+
+    @cached_property
+    def _totals(self) -> dict[str, int]:
+        return self.blocks.totals()
+
+    @cached_property
+    def decoded(self) -> Decoded:
+        """What the blocks hold, every rule checked."""
+        return decode_blocks(self.blocks, every_core(), self.__dict__.get("_where", "scene"))
+
+    @property
+    def positions(self) -> Positions:
+        """(q, 3) float32 vertices of all blocks in a row, in the model's unit."""
+        return self.decoded.positions
+
+    @property
+    def vertices(self) -> Counts:
+        """(n+2s,) int32 place in `positions` of each strip vertex."""
+        return self.decoded.vertices
+
+    @property
+    def turns(self) -> Bools:
+        """(n,) bool, the turn of each triangle; False for the first of a strip."""
+        return self.decoded.turns
+
+    @property
+    def flips(self) -> Bools | None:
+        """(n,) bool, the flip of each triangle; None where there is none."""
+        return self.decoded.flips
+
+    @property
+    def starts(self) -> Counts:
+        """(s+1,) int32, the first triangle of each strip, then n."""
+        return self.decoded.starts
+
+    @property
+    def block_starts(self) -> Counts:
+        """(b+1,) int32, the first triangle of each block, then n."""
+        return self.decoded.block_starts
+
+    @cached_property
+    def _faces(self) -> Faces:
+        faces = decode_strips(self.vertices, self.turns, self.starts, threads=every_core())
+        if self.flips is not None:
+            faces[self.flips, :2] = faces[self.flips, 1::-1]
+        return faces
 
     def faces(self) -> Faces:
         """Decode the strips, once; later calls give the same array.
 
         Returns:
-            (n, 3) int32 triangles in file order, with the source's winding.
+            (n, 3) int32 triangles in file order, with the source's winding: places in `positions`.
         """
-        decoded = self.__dict__.get("_faces")
-        if decoded is None:
-            decoded = decode_strips(self.vertices, self.turns, self.starts)
-            self.__dict__["_faces"] = decoded
-        return decoded
+        return self._faces
+
+    def triangle_boxes(self, threads: int | None = None) -> Boxes:
+        """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
+        return face_boxes(self.positions, self.faces(), threads or every_core())
+
+    def with_boxes(self, threads: int | None = None) -> PackedNodes:
+        """The complete hierarchy: as stored, or built and kept where boxes are not stored.
+
+        Args:
+            threads: Threads to build with, None for every core; the result is the same.
+        """
+        if self.packed.runs is not None or self.block_count == 0:
+            return self.packed
+        if "_complete" not in self.__dict__:
+            self.__dict__["_complete"] = _completed(self, threads or every_core())
+        return self.__dict__["_complete"]
+
+    def storing_boxes(self, threads: int | None = None) -> "Scene":
+        """The same scene with the boxes inside blocks stored."""
+        return self if self.block_count == 0 else replace(self, packed=self.with_boxes(threads))
+
+    def check(self) -> None:
+        """Make sure that the scene, and the file that it was opened from, keep every rule of the format.
+
+        Raises:
+            UnreadableSceneError: Naming the first rule broken, by its code.
+            LimitError: It is larger than the format can hold.
+        """
+        from striptools.reducem.check import check_scene
+
+        self.__dict__.get("_check", check_scene)(self)
 
     def to_mesh(self) -> Mesh:
         """Give the mesh back.
 
         Returns:
-            With a remap, the faces in the source's order, each from the source's first corner; without one,
-            in file order from the decoded first corner. Vertices stay in file order.
+            Vertices that are equal bit for bit are one again, in the order of their first block. With a
+            remap, the faces in the source's order, each from the source's first corner; without one, in
+            file order from the decoded first corner.
         """
         faces = self.faces()
         if self.remap is not None:
             back = (np.arange(3) - self.remap.rotation[:, None]) % 3
             order = np.argsort(self.remap.face, kind="stable")
-            faces = np.ascontiguousarray(np.take_along_axis(faces, back, axis=1)[order])
-        return Mesh(self.positions, faces)
+            faces = np.take_along_axis(faces, back, axis=1)[order]
+        leader, _ = weld_vertices(self.positions, threads=every_core())
+        is_leader = leader == np.arange(len(leader), dtype=np.int32)
+        place = np.cumsum(is_leader, dtype=np.int32) - np.int32(1)
+        return Mesh(self.positions[is_leader], np.ascontiguousarray(place[leader[faces]]))
 
-    def save(self, target: str | Path | IO[bytes]) -> "SectionSizes":
+    def save(self, target: str | Path | IO[bytes], *, archive: bool = False) -> int:
         """Write a scene file; the same scene gives the same bytes.
 
         Args:
             target: A path, written whole or not at all, or a binary stream.
+            archive: Compress every section where that makes it smaller; reading it takes the extra `archive`.
 
         Returns:
-            Bytes by part.
+            Bytes written.
 
         Raises:
             UnreadableSceneError: The scene breaks a rule of the format.
             LimitError: It is larger than the format can hold.
+            MissingExtraError: An archive is asked for, and its codec is not installed.
             WriteError: The file could not be written whole.
         """
         from striptools.reducem.writer import write_scene
 
-        return write_scene(self, target)
+        return write_scene(self, target, archive=archive)
 
     def part_bytes(self) -> dict[str, int]:
-        """Count the bytes of the scene file by part.
+        """Count the bytes of the scene file, not compressed, by part.
 
         Returns:
-            Bytes of `positions`, `strip_vertices`, `turns`, `strip_starts`, `hierarchy`, `remap` and
-            `headers` (file header, section table, scene record and padding); their sum is the file's length.
+            Bytes of `positions`, `connectivity` (start, turn and flip bits, and indices),
+            `in_block_hierarchy`, `block_headers`, `top_level`, `remap` and `container` (header, table,
+            scene record, metadata, and what fills up words and sections); their sum is the file's length.
         """
-        from striptools.reducem.writer import section_sizes
+        from striptools.reducem.writer import part_sizes
 
-        return section_sizes(self).parts()
+        return part_sizes(self)
 
     def bytes_per_triangle(self) -> float:
         """Say what a triangle costs: every byte of the file but the remap's, over the triangles."""
         parts = self.part_bytes()
-        return (sum(parts.values()) - parts["remap"]) / self.triangle_count
+        return (sum(parts.values()) - parts["remap"]) / max(1, self.triangle_count)
+
+    def resident_bytes_per_triangle(self) -> float:
+        """Say what tracing without unpacking holds, blocks and complete hierarchy, over the triangles."""
+        packed = self.with_boxes()
+        held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run, packed.runs]
+        return sum(array.nbytes for array in held if array is not None) / max(1, self.triangle_count)
+
+
+_FIELDS = frozenset(f.name for f in fields(Scene))
 
 
 def scene_from_strips(
     positions: Positions,
     strips: Strips,
-    hierarchy: StripHierarchy,
+    block_starts: Counts,
+    top: np.ndarray,
     *,
     source_face: FaceIds | None,
     source_face_count: int,
+    grid_exponent: int | None = None,
     error_bound: float = 0.0,
+    metadata: dict[str, Any] | None = None,
     threads: int = 1,
 ) -> Scene:
-    """Put a scene together, with its vertices in the order of their first use.
+    """Put a scene together from strips in blocks; the boxes inside blocks are to be rebuilt.
 
     Args:
         positions: (v, 3) float32 positions of the cleaned mesh; those that no strip uses are left out.
-        strips: In the order of the hierarchy's leaves.
-        hierarchy: Over the strips.
+        strips: Those of a block one after another, blocks in the order of the hierarchy's leaves.
+        block_starts: (b+1,) int32, the first triangle of each block, then n.
+        top: (t, 16) uint32, the nodes over blocks.
         source_face: (n,) int32, the source's face for each face of the cleaned mesh; None for no remap.
         source_face_count: Faces of the source mesh.
+        grid_exponent: See `Scene`.
         error_bound: See `Scene`.
+        metadata: See `Scene`.
         threads: How many threads share the work; the scene is the same for any number.
 
-    Returns:
-        The scene.
+    Raises:
+        UsageError: A block of more than 256 triangles or vertices.
     """
-    from striptools.kernels import scene as kernels
-
-    used, vertices = _by_first_use(strips.vertices, len(positions))
-    ordered = np.zeros((len(used), 3), np.float32)
-    in_chunks(lambda part: kernels.gather_rows(positions, used, *part, ordered), len(used), threads)
-    remap = None
-    if source_face is not None:
-        face = np.zeros(len(strips.source_face), np.int32)
-        order = strips.source_face
-        in_chunks(lambda part: kernels.gather_items(source_face, order, *part, face), len(face), threads)
-        remap = Remap(face, strips.rotation)
+    block_strips = np.searchsorted(strips.starts, block_starts).astype(np.int32)
+    blocks = encode_blocks(positions, strips, block_strips, threads)
+    low, high = bounds_of(positions)
     return Scene(
-        positions=ordered,
-        vertices=vertices,
-        turns=strips.turns,
-        starts=strips.starts,
-        hierarchy=hierarchy,
-        remap=remap,
+        blocks=blocks,
+        packed=PackedNodes(top, len(top), None, None, 0),
+        grid=box_grid(low, high),
+        low=low,
+        high=high,
+        grid_exponent=grid_exponent,
         error_bound=float(error_bound),
         source_face_count=int(source_face_count),
+        remap=None if source_face is None else _remap(source_face, strips, threads),
+        metadata=dict(metadata or {}),
     )
 
 
-def _by_first_use(vertices: Counts, vertex_count: int) -> tuple[Counts, Counts]:
-    """The vertices in the order of their first use, and the strip vertices by that numbering."""
-    from striptools.kernels.scene import renumber_by_first_use
+def empty_scene(source_face_count: int = 0, metadata: dict[str, Any] | None = None) -> Scene:
+    """The scene without a triangle."""
+    nothing = np.zeros(3, np.float32)
+    return Scene(
+        blocks=Blocks(np.zeros((0, 8), np.uint32), np.zeros(0, np.uint32)),
+        packed=PackedNodes(np.zeros((0, 16), np.uint32), 0, None, None, 0),
+        grid=BoxGrid(nothing, np.zeros(3, np.int32)),
+        low=nothing,
+        high=nothing,
+        grid_exponent=None,
+        error_bound=0.0,
+        source_face_count=source_face_count,
+        remap=None,
+        metadata=dict(metadata or {}),
+    )
 
-    place = np.full(vertex_count, -1, np.int32)
-    numbered, used = np.zeros(len(vertices), np.int32), np.zeros(vertex_count, np.int32)
-    count = renumber_by_first_use(vertices, place, numbered, used)
-    return used[:count], numbered
+
+def bounds_of(positions: Positions) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest coordinates, (3,) float32 each, -0.0 as 0.0; zeros where there is none."""
+    if len(positions) == 0:
+        return np.zeros(3, np.float32), np.zeros(3, np.float32)
+    zero = np.float32(0)
+    return positions.min(axis=0) + zero, positions.max(axis=0) + zero
+
+
+def _remap(source_face: FaceIds, strips: Strips, threads: int) -> Remap:
+    from striptools.kernels.scene import gather_items
+
+    face, order = np.zeros(len(strips.source_face), np.int32), strips.source_face
+    in_chunks(lambda part: gather_items(source_face, order, *part, face), len(face), threads)
+    return Remap(face, strips.rotation)
+
+
+def _completed(scene: Scene, threads: int) -> PackedNodes:
+    given = (scene.triangle_boxes(threads), scene.block_starts, scene.starts, scene.grid)
+    top = scene.packed.top_count
+    nodes, first_run, runs = build_inner(*given, top, LONGEST_RUN, threads)
+    return PackedNodes(np.concatenate([scene.packed.nodes, nodes]), top, first_run, runs, LONGEST_RUN)

@@ -1,252 +1,342 @@
 """Name every flaw of a scene file, without the reader, so that it shares none of the reader's blind spots.
 
-It reads the bytes by the specification with `struct`, walks the hierarchy in plain Python, and takes from
-this package only the issue catalogue and the decoding of strips.
+It reads the bytes by the specification and takes from this package only the issue catalogue. A layer is
+looked at where the one below it is whole: header, table, scene record, blocks, nodes. Time and memory are
+linear in the length of the file, or in the decoded lengths of an archive once the counts have borne them out.
 """
 
+import json
 import math
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 import numpy as np
 
+from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.issues import ISSUES, Finding
-from striptools.strips.topology import decode_strips
+from striptools.reducem.validate_blocks import inspect_blocks
+from striptools.reducem.validate_nodes import inspect_nodes
+from striptools.reducem.validate_packed import unpack
 
 __all__ = ["validate"]
 
-_NEEDED = {b"SCEN", b"POSN", b"SVTX", b"TURN", b"STRT", b"HIER"}
-_KNOWN = _NEEDED | {b"RMAP"}
-
-
-@dataclass
-class _Parsed:
-    """What is known of a file so far, and what was found."""
-
-    data: bytes
-    where: str
-    findings: list[Finding] = field(default_factory=list)
-    sections: dict[bytes, bytes] = field(default_factory=dict)
-
-    def found(self, code: str, place: str = "") -> None:
-        where = f"{self.where}: {place}" if place else self.where
-        self.findings.append(Finding(ISSUES[code], where))
-
-    @property
-    def has_errors(self) -> bool:
-        return any(finding.issue.severity == "error" for finding in self.findings)
+_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
+_KNOWN = (*_NEEDED, "RMAP", "META")
+_MOST_METADATA = 2**20
+_MOST_LEVELS = 32
 
 
 def validate(source: str | Path | bytes | bytearray | memoryview | IO[bytes]) -> list[Finding]:
     """Name every flaw of a scene file.
 
-    A layer is looked at only where the one below it is whole: header, table, contents.
-
     Args:
         source: A path, the file's bytes, or a binary stream of it; it is read to its end.
 
     Returns:
-        The findings in the order of the file; no one of severity `error` means that it is valid.
+        The findings, a kind of flaw once for each section, in the order in which they were looked for; no one
+        of severity `error` means that the file is valid.
     """
-    where = "scene"
+    where = str(source) if isinstance(source, str | Path) else str(getattr(source, "name", "scene"))
     try:
         if isinstance(source, str | Path):
-            where, data = str(source), Path(source).read_bytes()
+            data = Path(source).read_bytes()
         elif isinstance(source, bytes | bytearray | memoryview):
             data = bytes(source)
         else:
-            where, data = str(getattr(source, "name", "the input stream")), source.read()
+            data = source.read()
     except (OSError, ValueError):
         return [Finding(ISSUES["RDM001"], where)]
-    parsed = _Parsed(data, where)
-    for layer in (_header, _table, _scene):
-        layer(parsed)
-        if parsed.has_errors:
+    inspection = Inspection(data, where)
+    for layer in (_header, _table, _contents):
+        if not layer(inspection):
             break
-    return parsed.findings
+    return inspection.findings
 
 
-def _header(parsed: _Parsed) -> None:
-    data = parsed.data
+def _header(inspection: Inspection) -> bool:
+    """Look at the header; says whether the table can be looked at."""
+    data = inspection.data
     magic = b"\x89RDM\r\n\x1a\n"
     if data[:8] != magic[: len(data)]:
-        return parsed.found("RDM102")
+        inspection.found("RDM102", "", 0)
+        return False
     if len(data) < 32:
-        return parsed.found("RDM101")
+        inspection.found("RDM101", "", len(data))
+        return False
     major, minor, count, total, reserved, checksum = struct.unpack_from("<HHIQII", data, 8)
-    if (major, minor) != (0, 1):
-        return parsed.found("RDM103", f"version {major}.{minor}")
-    if total != len(data):
-        parsed.found("RDM104")
-    if count < 1 or count > 64 or 32 + 32 * count > len(data):
-        return parsed.found("RDM105")
-    if zlib.crc32(data[:28] + data[32 : 32 + 32 * count]) != checksum:
-        return parsed.found("RDM106")
+    if (major, minor) != (0, 3):
+        inspection.found("RDM103", f"version {major}.{minor}", 8)
+        return False
+    if total != len(data) or total % 64:
+        inspection.found("RDM104", f"{len(data)} bytes, not {total}", 16)
     if reserved:
-        parsed.found("RDM107")
-    return None
+        inspection.found("RDM107", "header", 24)
+    if not 1 <= count <= 64 or 32 + 40 * count > len(data):
+        inspection.found("RDM105", f"{count} sections", 12)
+        return False
+    if zlib.crc32(data[32 : 32 + 40 * count], zlib.crc32(data[:28])) != checksum:
+        inspection.found("RDM106", "", 28)
+    return True
 
 
-def _table(parsed: _Parsed) -> None:
-    data = parsed.data
-    count = struct.unpack_from("<I", data, 12)[0]
-    end = 32 + 32 * count
-    seen: set[bytes] = set()
-    for kind, flags, offset, length, checksum, reserved in struct.iter_unpack("<4sIQQII", data[32:end]):
-        place = kind.decode("ascii", "backslashreplace")
+@dataclass(frozen=True)
+class _Entry:
+    """A row of the section table, and the byte of the file where it begins."""
+
+    at: int
+    kind: str
+    flags: int
+    codec: int
+    offset: int
+    stored_length: int
+    raw_length: int
+    stored_checksum: int
+    raw_checksum: int
+
+    @property
+    def place(self) -> str:
+        """The kind as one word on one line."""
+        return ascii(self.kind)[1:-1]
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.stored_length
+
+
+def _table(inspection: Inspection) -> bool:
+    """Look at the table and what lies between sections; says whether the sections can be looked at."""
+    data = inspection.data
+    end = 32 + 40 * struct.unpack_from("<I", data, 12)[0]
+    entries: list[_Entry] = []
+    for at in range(32, end, 40):
+        kind, *fields = struct.unpack_from("<4sHHQQQII", data, at)
+        entry = _Entry(at, kind.decode("latin-1"), *fields)
         start = end + -end % 64
-        if offset != start or length == 0 or offset + length > len(data):
-            return parsed.found("RDM109", place)
-        if data[end:start].strip(b"\0"):
-            parsed.found("RDM108", place)
-        end = offset + length
-        if kind in seen:
-            parsed.found("RDM112", place)
-        seen.add(kind)
-        _entry(parsed, kind, flags, reserved, place)
-        payload = data[offset:end]
-        if zlib.crc32(payload) != checksum:
-            parsed.found("RDM110", place)
-        parsed.sections[kind] = payload
+        if entry.stored_length == 0 or entry.raw_length == 0:
+            inspection.found("RDM109", entry.place, at + (16 if entry.stored_length == 0 else 24))
+            return False
+        if entry.offset != start or entry.end > len(data):
+            inspection.found("RDM109", entry.place, at + 8)
+            return False
+        _padding(inspection, end, start)
+        if entry.kind in {other.kind for other in entries}:
+            inspection.found("RDM112", entry.place, at)
+        _entry(inspection, entry)
+        entries.append(entry)
+        end = entry.end
     if end + -end % 64 != len(data):
-        return parsed.found("RDM104")
-    if data[end:].strip(b"\0"):
-        parsed.found("RDM108")
+        inspection.found("RDM104", f"the last section ends at byte {end}", 16)
+    _padding(inspection, end, len(data))
+    return _sections(inspection, entries)
+
+
+def _padding(inspection: Inspection, start: int, end: int) -> None:
+    rest = inspection.data[start:end].lstrip(b"\0")
+    if rest:
+        inspection.found("RDM108", "", end - len(rest))
+
+
+def _entry(inspection: Inspection, entry: _Entry) -> None:
+    """Look at one row of the table, and at the checksum of the stored bytes."""
+    if entry.flags > 1:
+        inspection.found("RDM107", entry.place, entry.at + 4)
+    if entry.kind not in _KNOWN:
+        if entry.flags & 1:
+            inspection.found("RDM111", entry.place, entry.at + 4)
+        else:
+            inspection.found("RDM115", entry.place, entry.at)
+    elif (entry.flags & 1) != (entry.kind in _NEEDED):
+        inspection.found("RDM116", entry.place, entry.at + 4)
+    raw = (entry.stored_length, entry.stored_checksum)
+    if entry.codec == 0 and raw != (entry.raw_length, entry.raw_checksum):
+        inspection.found("RDM118", entry.place, entry.at + 24)
+    if entry.kind in _KNOWN and entry.codec > 1:
+        inspection.found("RDM119", entry.place, entry.at + 6)
+    if entry.kind == "SCEN" and entry.codec != 0:
+        inspection.found("RDM120", entry.place, entry.at + 6)
+    if zlib.crc32(inspection.data[entry.offset : entry.end]) != entry.stored_checksum:
+        inspection.found("RDM110", entry.place, entry.at + 32)
+
+
+def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
+    """Decode the known sections; says whether there is a scene record."""
+    first: dict[str, _Entry] = {}
+    for entry in entries:
+        if entry.kind in _KNOWN:
+            first.setdefault(entry.kind, entry)
+    if "SCEN" not in first:
+        inspection.found("RDM113", "SCEN", 32)
+        return False
+    entry = first.pop("SCEN")
+    if entry.codec != 0:
+        return False
+    payload = inspection.data[entry.offset : entry.end]
+    inspection.sections["SCEN"] = Section("SCEN", entry.offset, 0, payload)
+    if len(payload) != 96:
+        inspection.found("RDM114", "SCEN", entry.at + 16)
+        return False
+    lengths = _lengths(*struct.unpack_from("<5I", payload), payload[24] & 1)
+    for kind, entry in first.items():
+        _decode(inspection, entry, lengths[kind])
+    for kind, (least, _) in lengths.items():
+        if least and kind not in first and kind not in ("RMAP", "META"):
+            inspection.found("RDM113", kind, 32)
+    return True
+
+
+def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str, tuple[int, int]]:
+    """The least and the most bytes of each section by the counts; (0, 0) where it must not be there."""
+    runs, remap = (4 * b + 2 * r) * stored, 4 * n + -(-n // 4)
+    lengths = {"BLKH": (32 * b, 32 * b), "BLKD": (64, 3936 * b + 128) if b else (0, 0)}
+    lengths |= {"NODE": (64 * m, 64 * m), "RUNS": (runs, runs)}
+    return lengths | {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
+
+
+def _decode(inspection: Inspection, entry: _Entry, lengths: tuple[int, int]) -> None:
+    """Decode one section whose length is what the counts say, or note that it is not."""
+    inspection.undecoded.add(entry.kind)
+    if lengths[1] == 0:
+        return inspection.found("RDM117", entry.place, entry.at)
+    if not lengths[0] <= entry.raw_length <= lengths[1]:
+        code = "RDM902" if entry.kind == "META" else "RDM114"
+        return inspection.found(code, entry.place, entry.at + 24)
+    payload = inspection.data[entry.offset : entry.end]
+    if entry.codec == 1:
+        code, payload = unpack(payload, entry.raw_length)
+        if code:
+            return inspection.found(code, entry.place, entry.offset)
+        if zlib.crc32(payload) != entry.raw_checksum:
+            inspection.found("RDM122", entry.place, entry.at + 36)
+    if entry.codec <= 1 and len(payload) == entry.raw_length:
+        inspection.undecoded.remove(entry.kind)
+        inspection.sections[entry.kind] = Section(entry.kind, entry.offset, entry.codec, payload)
     return None
 
 
-def _entry(parsed: _Parsed, kind: bytes, flags: int, reserved: int, place: str) -> None:
-    if flags > 1 or reserved:
-        parsed.found("RDM107", place)
-    elif kind not in _KNOWN:
-        parsed.found("RDM111" if flags else "RDM115", place)
-    elif flags != (kind in _NEEDED):
-        parsed.found("RDM116", place)
+def _contents(inspection: Inspection) -> bool:
+    """Look into the sections, each where it and what it leans on are whole."""
+    sections = inspection.sections
+    _record(inspection, sections["SCEN"])
+    if "BLKH" in sections and "BLKD" in sections:
+        geometry = inspect_blocks(inspection)
+        if geometry is not None and "NODE" in sections:
+            inspect_nodes(inspection, geometry)
+    if "RMAP" in sections:
+        _remap(inspection, sections["RMAP"])
+    if "META" in sections:
+        _metadata(inspection, sections["META"])
+    return True
 
 
-def _scene(parsed: _Parsed) -> None:
-    sections = parsed.sections
-    if b"SCEN" not in sections:
-        return parsed.found("RDM113", "SCEN")
-    if len(sections[b"SCEN"]) != 24:
-        return parsed.found("RDM114", "SCEN")
-    triangles, vertices, strips, source_faces, error_bound = struct.unpack("<4Id", sections[b"SCEN"])
-    if not (1 <= strips <= triangles <= 2**29 and 3 <= vertices <= triangles + 2 * strips):
-        return parsed.found("RDM201", "SCEN")
-    if not triangles <= source_faces <= 2**30:
-        parsed.found("RDM201", "SCEN")
+def _record(inspection: Inspection, section: Section) -> None:
+    """Look at the fields of the scene record."""
+    n, b, m, top, r, source_faces, flags, reserved, grid = struct.unpack_from("<6IBBh", section.data)
+    reserved_2 = section.data[28:32] != bytes(4)
+    *cells, longest = struct.unpack_from("<3hH", section.data, 64)
+    stored = flags & 1
+    for at, wrong in ((24, flags > 3), (25, reserved), (28, reserved_2), (72, any(section.data[72:]))):
+        if wrong:
+            inspection.found("RDM107", "SCEN", section.at(at))
+    counts = (
+        (4, b > 2**24 or (b == 0) != (n == 0) or not b <= n <= 256 * b),
+        (8, m > 2**28 or (m < top + b if stored else m != top)),
+        (12, (top == 0) != (b < 2)),
+        (16, not b <= r <= n if stored else r),
+        (20, source_faces < n),
+    )
+    for at, wrong in counts:
+        if wrong:
+            inspection.found("RDM201", "SCEN", section.at(at))
+    _numbers(inspection, section)
+    if not (-149 <= grid <= 104 if flags & 2 else grid == 0):
+        inspection.found("RDM203", "SCEN", section.at(26))
+    for axis, cell in enumerate(cells):
+        if not -149 <= cell <= 127:
+            inspection.found("RDM206", "SCEN", section.at(64 + 2 * axis))
+    if not (1 <= longest <= 8 if stored else longest == 0):
+        inspection.found("RDM207", "SCEN", section.at(70))
+    _empty(inspection, section, n, stored)
+
+
+def _numbers(inspection: Inspection, section: Section) -> None:
+    """Look at the floats of the scene record by themselves."""
+    error_bound, *bounds = struct.unpack_from("<d6f", section.data, 32)
     if not (math.isfinite(error_bound) and error_bound >= 0):
-        parsed.found("RDM202", "SCEN")
-    _lengths(parsed, triangles, vertices, strips)
-    if not parsed.has_errors:
-        _contents(parsed, triangles, vertices, strips)
-        if b"RMAP" in sections:
-            _remap(parsed, source_faces)
+        inspection.found("RDM202", "SCEN", section.at(32))
+    for i, bound in enumerate(bounds):
+        if not math.isfinite(bound):
+            inspection.found("RDM205", "SCEN", section.at(40 + 4 * i))
+            break
+
+
+def _empty(inspection: Inspection, section: Section, triangles: int, stored: int) -> None:
+    """Look at what an empty scene must not have; its counts are looked at with the others."""
+    if triangles == 0:
+        if stored:
+            inspection.found("RDM208", "SCEN", section.at(24))
+        rest = section.data[40:70].lstrip(b"\0")
+        if rest:
+            inspection.found("RDM208", "SCEN", section.at(70 - len(rest)))
+
+
+def _remap(inspection: Inspection, section: Section) -> None:
+    """Look at the faces and rotations of the remap."""
+    n, source_faces = (int(x) for x in np.frombuffer(inspection.sections["SCEN"].data, "<u4")[[0, 5]])
+    faces = np.frombuffer(section.data, "<u4", n)
+    packed = np.frombuffer(section.data, np.uint8, offset=4 * n)
+    rotations = (packed[:, None] >> np.array([0, 2, 4, 6], np.uint8) & 3).ravel()
+
+    def name(t: int) -> str:
+        return f"RMAP: triangle {t}"
+
+    inspection.found_where("RDM501", rotations[:n] == 3, name, lambda t: section.at(4 * n + t // 4))
+    inspection.found_where("RDM504", rotations[n:] != 0, lambda t: name(n - 1), lambda t: section.at(5 * n))
+    inspection.found_where("RDM502", faces >= source_faces, name, lambda t: section.at(4 * t))
+    order = np.argsort(faces, kind="stable")
+    again = np.zeros(n, np.bool_)
+    again[order[1:]] = faces[order[1:]] == faces[order[:-1]]
+    inspection.found_where("RDM503", again, name, lambda t: section.at(4 * t))
+
+
+def _metadata(inspection: Inspection, section: Section) -> None:
+    """Look at the metadata; nothing is followed down before its depth is known."""
+    try:
+        text = section.data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return inspection.found("RDM901", "META", section.at(error.start))
+    if _levels(text) > _MOST_LEVELS:
+        return inspection.found("RDM904", "META", section.offset)
+    try:
+        # Numbers stay text: Python refuses more than 4,300 digits, JSON does not.
+        metadata = json.loads(text, parse_int=str, parse_float=str, parse_constant=_no_number)
+    except json.JSONDecodeError as error:
+        return inspection.found("RDM901", "META", section.at(len(text[: error.pos].encode())))
+    except ValueError:
+        return inspection.found("RDM901", "META", section.offset)
+    if not isinstance(metadata, dict):
+        return inspection.found("RDM901", "META", section.offset)
+    for name in ("generator", "source", "unit"):
+        if not isinstance(metadata.get(name, ""), str):
+            inspection.found("RDM903", f"META: {name}", section.offset)
     return None
 
 
-def _lengths(parsed: _Parsed, triangles: int, vertices: int, strips: int) -> None:
-    wanted = {
-        b"POSN": vertices * 12,
-        b"SVTX": (triangles + strips * 2) * 4,
-        b"TURN": -(-triangles // 8),
-        b"STRT": strips * 4 + 4,
-        b"HIER": (strips - 1) * 28,
-    }
-    if b"RMAP" in parsed.sections:
-        wanted[b"RMAP"] = triangles * 4
-    for kind, length in wanted.items():
-        if kind not in parsed.sections and length:
-            parsed.found("RDM113", kind.decode())
-        elif len(parsed.sections.get(kind, b"")) != length:
-            parsed.found("RDM114", kind.decode())
+def _levels(text: str) -> int:
+    """How deep arrays and objects are nested; brackets in strings do not count."""
+    codes = np.frombuffer(text.encode("utf-32-le", "surrogatepass"), "<u4")
+    quotes, slashes = codes == ord('"'), codes == ord("\\")
+    # A quote counts unless the row of backslashes before it is odd.
+    last_other = np.maximum.accumulate(np.where(slashes, -1, np.arange(len(codes))))
+    before = np.concatenate([[-1], last_other[:-1]]) if len(codes) else last_other
+    rows = np.arange(len(codes)) - 1 - before
+    in_string = np.cumsum(quotes & (rows % 2 == 0)) % 2 == 1
+    opening = ((codes == ord("[")) | (codes == ord("{"))) & ~in_string
+    closing = ((codes == ord("]")) | (codes == ord("}"))) & ~in_string
+    return int(np.cumsum(opening.astype(np.int64) - closing).max(initial=0))
 
 
-def _contents(parsed: _Parsed, triangles: int, vertices: int, strips: int) -> None:
-    positions = np.frombuffer(parsed.sections[b"POSN"], "<f4").reshape(vertices, 3)
-    starts = np.frombuffer(parsed.sections[b"STRT"], "<u4").astype(np.int64)
-    index = np.frombuffer(parsed.sections[b"SVTX"], "<u4").astype(np.int64)
-    bits = np.unpackbits(np.frombuffer(parsed.sections[b"TURN"], np.uint8), bitorder="little")
-    for row in np.argwhere(~np.isfinite(positions))[:1]:
-        parsed.found("RDM301", f"POSN: position {row[0]}")
-    if bits[triangles:].any():
-        parsed.found("RDM304", "TURN")
-    if starts[0] != 0 or starts[-1] != triangles or (np.diff(starts) <= 0).any():
-        parsed.found("RDM302", "STRT")
-    elif bits[starts[:-1]].any():
-        parsed.found("RDM303", "TURN")
-    if (index >= vertices).any():
-        parsed.found("RDM305", "SVTX")
-    else:
-        _first_uses(parsed, index, vertices)
-    if not parsed.has_errors:
-        turns = bits[:triangles].astype(np.bool_)
-        _repeats(parsed, decode_strips(index.astype(np.int32), turns, starts.astype(np.int32)))
-        _hierarchy(parsed, positions[index], starts + 2 * np.arange(strips + 1), strips)
-
-
-def _first_uses(parsed: _Parsed, index: np.ndarray, vertices: int) -> None:
-    used, first_use = np.unique(index, return_index=True)
-    if len(used) < vertices:
-        parsed.found("RDM307", "POSN")
-    if (np.diff(first_use) < 0).any() or (used[: len(first_use)] != np.arange(len(used))).any():
-        parsed.found("RDM306", "SVTX")
-
-
-def _repeats(parsed: _Parsed, faces: np.ndarray) -> None:
-    ordered = np.sort(faces, axis=1)
-    for row in np.argwhere(ordered[:, 1:] == ordered[:, :-1])[:1]:
-        parsed.found("RDM308", f"SVTX: triangle {row[0]}")
-
-
-def _hierarchy(parsed: _Parsed, corners: np.ndarray, ends: np.ndarray, strips: int) -> None:
-    payload = parsed.sections.get(b"HIER", b"")
-    boxes = np.frombuffer(payload[: 24 * (strips - 1)], "<f4").reshape(strips - 1, 6)
-    lefts = np.frombuffer(payload[24 * (strips - 1) :], "<u4").tolist()
-    for row in np.argwhere(~np.isfinite(boxes))[:1]:
-        return parsed.found("RDM402", f"HIER: node {row[0]}")
-    children = _children(lefts, strips)
-    if isinstance(children, int):
-        return parsed.found("RDM401", f"HIER: node {children}")
-    leaf_low = np.minimum.reduceat(corners, ends[:-1])
-    leaf_high = np.maximum.reduceat(corners, ends[:-1])
-    # Leaves stand behind the nodes, so that one index names either.
-    low, high = np.concatenate([boxes[:, :3], leaf_low]), np.concatenate([boxes[:, 3:], leaf_high])
-    for side in np.array(children, np.int64).reshape(-1, 2).T:
-        spilled = (low[side] < boxes[:, :3]) | (high[side] > boxes[:, 3:])
-        for row in np.argwhere(spilled)[:1]:
-            return parsed.found("RDM403", f"HIER: node {row[0]}")
-    return None
-
-
-def _children(lefts: list[int], strips: int) -> list[tuple[int, int]] | int:
-    nodes = strips - 1
-    children: list[tuple[int, int]] = []
-    waiting = [(0, strips)]
-    for node, left in enumerate(lefts):
-        first, count = waiting.pop()
-        right = count - left
-        if left < 1 or right < 1:
-            return node
-        if right > 1:
-            waiting.append((first + left, right))
-        if left > 1:
-            waiting.append((first, left))
-        children.append(
-            (node + 1 if left > 1 else nodes + first, node + left if right > 1 else nodes + first + left)
-        )
-    return children
-
-
-def _remap(parsed: _Parsed, source_faces: int) -> None:
-    words = np.frombuffer(parsed.sections[b"RMAP"], "<u4").astype(np.int64)
-    if (words >= 3 << 30).any():
-        parsed.found("RDM501", "RMAP")
-    faces = words % (1 << 30)
-    if (faces >= source_faces).any():
-        parsed.found("RDM502", "RMAP")
-    if len(np.unique(faces)) < len(faces):
-        parsed.found("RDM503", "RMAP")
+def _no_number(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")

@@ -3,157 +3,202 @@
 The layout and its reasons are in formats/reducem/SPEC.md. The same scene gives the same bytes.
 """
 
+import json
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
 from striptools.mesh.atomic import write_atomically, write_stream
 from striptools.reducem import layout
-from striptools.reducem.check import check_limits, check_scene
-from striptools.reducem.scene import Scene
+from striptools.reducem.archive import compressed
+from striptools.reducem.check import check_scene
+from striptools.reducem.issues import unreadable
+from striptools.reducem.scene import Remap, Scene
 
-__all__ = ["SectionSizes", "section_sizes", "write_scene"]
+__all__ = ["part_sizes", "write_scene"]
+
+Payload = bytes | memoryview
 
 
 @dataclass(frozen=True)
-class SectionSizes:
-    """Bytes of a scene file by part; `headers` is everything that is in no other, padding included."""
+class _Stored:
+    """A section as it is written."""
 
-    positions: int
-    strip_vertices: int
-    turns: int
-    strip_starts: int
-    hierarchy: int
-    remap: int
-    headers: int
-
-    @property
-    def total(self) -> int:
-        """Bytes of the file."""
-        return sum(self.parts().values())
-
-    def parts(self) -> dict[str, int]:
-        """Bytes by part name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    section: layout.Section
+    codec: int
+    raw_length: int
+    raw_checksum: int
+    payload: Payload
 
 
-def write_scene(scene: Scene, target: str | Path | IO[bytes]) -> SectionSizes:
+def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool = False) -> int:
     """Write a scene file.
 
     Args:
         scene: The scene; every rule of the format is checked first.
         target: A path, written whole or not at all, or a binary stream.
+        archive: Compress every section but the scene record where that makes it smaller.
 
     Returns:
-        Bytes by part.
+        Bytes written.
 
     Raises:
         LimitError: The scene is larger than the format can hold.
         UnreadableSceneError: It breaks a rule of the format.
+        MissingExtraError: An archive is asked for, and its codec is not installed.
         WriteError: The file could not be written whole.
     """
-    check_limits(scene)
     check_scene(scene)
+    sections = [_stored(section, payload, archive) for section, payload in _payloads(scene) if len(payload)]
 
     def write(file: IO[bytes]) -> None:
-        for chunk in _chunks(scene):
+        for chunk in _chunks(sections):
             file.write(chunk)
 
     if isinstance(target, str | Path):
-        write_atomically(target, write)
-    else:
-        write_stream(target, write)
-    return section_sizes(scene)
+        return write_atomically(target, write)
+    return write_stream(target, write)
 
 
-def section_sizes(scene: Scene) -> SectionSizes:
-    """Count the bytes of a scene's file by part, without writing it."""
+def part_sizes(scene: Scene) -> dict[str, int]:
+    """Count the bytes of a scene's file by part, uncompressed, without writing it."""
+    totals, packed = scene.blocks.totals(), scene.packed
     lengths = _lengths(scene)
-    parts: dict[str, int] = dict.fromkeys(layout.PARTS, 0)
-    for section in layout.SECTIONS:
-        if section is not layout.SCENE:
-            parts[section.part] += lengths.get(section.kind, 0)
-    total = _table_end(len(lengths)) + sum(layout.aligned(length) for length in lengths.values())
-    parts["headers"] = total - sum(parts.values())
-    return SectionSizes(**parts)
+    parts = dict.fromkeys(layout.PARTS, 0)
+    parts["positions"] = -(-totals["position_bits"] // 8)
+    parts["connectivity"] = totals["connectivity_bits"] // 8
+    parts["block_headers"] = lengths[layout.BLOCK_HEADERS.kind]
+    parts["top_level"] = layout.NODE_RECORD.size * packed.top_count
+    parts["in_block_hierarchy"] = lengths[layout.NODES.kind] - parts["top_level"] + lengths[layout.RUNS.kind]
+    parts["remap"] = lengths[layout.REMAP.kind]
+    present = [length for length in lengths.values() if length]
+    total = _table_end(len(present)) + sum(map(layout.aligned, present))
+    parts["container"] = total - sum(parts.values())
+    return parts
 
 
 def _lengths(scene: Scene) -> dict[bytes, int]:
+    packed = scene.packed
+    runs = 0 if packed.runs is None else len(packed.runs)
     lengths = layout.section_lengths(
-        scene.triangle_count, scene.vertex_count, scene.strip_count, remap=scene.remap is not None
+        scene.triangle_count,
+        scene.block_count,
+        len(packed.nodes),
+        runs,
+        boxes_stored=packed.runs is not None,
     )
-    return {kind: length for kind, length in lengths.items() if length}
+    lengths[layout.BLOCK_DATA.kind] = scene.blocks.words.nbytes
+    lengths[layout.METADATA.kind] = len(_metadata(scene.metadata))
+    if scene.remap is None:
+        lengths[layout.REMAP.kind] = 0
+    return lengths
 
 
 def _table_end(sections: int) -> int:
     return layout.aligned(layout.HEADER.size + sections * layout.ENTRY.size)
 
 
-def _chunks(scene: Scene) -> Iterator[bytes | memoryview]:
-    payloads = {kind: payload for kind, payload in _payloads(scene).items() if payload}
-    head = _head(payloads)
-    yield head + bytes(_table_end(len(payloads)) - len(head))
-    for payload in payloads.values():
-        yield payload
-        yield bytes(layout.aligned(len(payload)) - len(payload))
+def _chunks(sections: list[_Stored]) -> Iterator[Payload]:
+    head = _head(sections)
+    yield head + bytes(layout.aligned(len(head)) - len(head))
+    for stored in sections:
+        yield stored.payload
+        yield bytes(layout.aligned(len(stored.payload)) - len(stored.payload))
 
 
-def _payloads(scene: Scene) -> dict[bytes, bytes | memoryview]:
-    return {
-        layout.SCENE.kind: _scene_record(scene),
-        layout.POSITIONS.kind: _view(scene.positions, "<f4"),
-        layout.STRIP_VERTICES.kind: _view(scene.vertices, "<i4"),
-        layout.TURNS.kind: np.packbits(scene.turns, bitorder="little").tobytes(),
-        layout.STRIP_STARTS.kind: _view(scene.starts, "<i4"),
-        layout.HIERARCHY.kind: scene.hierarchy.boxes.astype("<f4", copy=False).tobytes()
-        + scene.hierarchy.left_count.astype("<u4", copy=False).tobytes(),
-        layout.REMAP.kind: _remap_words(scene),
-    }
+def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
+    packed = scene.packed
+    runs = (
+        b"" if packed.runs is None else _view(packed.first_run, "<u4").tobytes() + _view(packed.runs, "<u2")
+    )
+    return [
+        (layout.SCENE, _scene_record(scene)),
+        (layout.BLOCK_HEADERS, _view(scene.blocks.headers, "<u4")),
+        (layout.BLOCK_DATA, _view(scene.blocks.words, "<u4")),
+        (layout.NODES, _view(packed.nodes, "<u4")),
+        (layout.RUNS, runs),
+        (layout.REMAP, _remap(scene.remap)),
+        (layout.METADATA, _metadata(scene.metadata)),
+    ]
 
 
-def _view(array: np.ndarray, kind: str) -> memoryview:
-    """The bytes of an array without a copy; no number in it is negative, so the sign bit is one more bit."""
+def _stored(section: layout.Section, payload: Payload, archive: bool) -> _Stored:
+    checksum = zlib.crc32(payload)
+    plain = _Stored(section, layout.CODEC_RAW, len(payload), checksum, payload)
+    if not archive or section is layout.SCENE:
+        return plain
+    packed = compressed(payload)
+    if len(packed) >= len(payload):
+        return plain
+    return _Stored(section, layout.CODEC_ZSTD, len(payload), checksum, packed)
+
+
+def _view(array: Any, kind: str) -> memoryview:
+    """The bytes of an array, without a copy where it is little endian already."""
     return np.ascontiguousarray(array, kind).reshape(-1).view(np.uint8).data
 
 
 def _scene_record(scene: Scene) -> bytes:
+    packed = scene.packed
     record = np.zeros(1, layout.SCENE_RECORD.dtype)
     record["triangle_count"] = scene.triangle_count
-    record["vertex_count"] = scene.vertex_count
-    record["strip_count"] = scene.strip_count
+    record["block_count"] = scene.block_count
+    record["node_count"] = len(packed.nodes)
+    record["top_count"] = packed.top_count
+    record["run_count"] = 0 if packed.runs is None else len(packed.runs)
     record["source_face_count"] = scene.source_face_count
+    record["flags"] = (0 if packed.runs is None else layout.BOXES_STORED) | (
+        0 if scene.grid_exponent is None else layout.ON_GRID
+    )
+    record["grid_exponent"] = scene.grid_exponent or 0
     record["error_bound"] = scene.error_bound
+    for axis, name in enumerate("xyz"):
+        record[f"low_{name}"] = scene.low[axis]
+        record[f"high_{name}"] = scene.high[axis]
+        record[f"cell_{name}"] = scene.grid.cell[axis]
+    record["longest_run"] = packed.longest_run
     return record.tobytes()
 
 
-def _remap_words(scene: Scene) -> bytes | memoryview:
-    if scene.remap is None:
+def _remap(remap: Remap | None) -> bytes:
+    if remap is None:
         return b""
-    words = scene.remap.rotation.astype("<u4")
-    words <<= layout.ROTATION_SHIFT
-    words |= scene.remap.face.view("<u4")
-    return _view(words, "<u4")
+    rotation = np.zeros((-(-len(remap.rotation) // 4), 4), np.uint8)
+    rotation.reshape(-1)[: len(remap.rotation)] = remap.rotation
+    packed = rotation[:, 0] | rotation[:, 1] << 2 | rotation[:, 2] << 4 | rotation[:, 3] << 6
+    return _view(remap.face, "<i4").tobytes() + packed.tobytes()
 
 
-def _head(payloads: dict[bytes, bytes | memoryview]) -> bytes:
-    table = np.zeros(len(payloads), layout.ENTRY.dtype)
-    must_understand = {section.kind: section.must_understand for section in layout.SECTIONS}
-    offset = _table_end(len(payloads))
-    for entry, (kind, payload) in zip(table, payloads.items(), strict=True):
-        entry["kind"] = kind
-        entry["flags"] = layout.MUST_UNDERSTAND if must_understand[kind] else 0
+def _metadata(metadata: dict[str, Any]) -> bytes:
+    if not metadata:
+        return b""
+    text = json.dumps(metadata, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+    if len(text) > layout.METADATA_LIMIT:
+        raise unreadable("RDM902", "META")
+    return text
+
+
+def _head(sections: list[_Stored]) -> bytes:
+    table = np.zeros(len(sections), layout.ENTRY.dtype)
+    offset = _table_end(len(sections))
+    for entry, stored in zip(table, sections, strict=True):
+        entry["kind"] = stored.section.kind
+        entry["flags"] = layout.MUST_UNDERSTAND if stored.section.must_understand else 0
+        entry["codec"] = stored.codec
         entry["offset"] = offset
-        entry["length"] = len(payload)
-        entry["checksum"] = zlib.crc32(payload)
-        offset += layout.aligned(len(payload))
+        entry["stored_length"] = len(stored.payload)
+        entry["raw_length"] = stored.raw_length
+        entry["raw_checksum"] = stored.raw_checksum
+        entry["stored_checksum"] = zlib.crc32(stored.payload) if stored.codec else stored.raw_checksum
+        offset += layout.aligned(len(stored.payload))
     header = np.zeros(1, layout.HEADER.dtype)
     header["magic"] = layout.MAGIC
     header["major"], header["minor"] = layout.VERSION
-    header["section_count"] = len(payloads)
+    header["section_count"] = len(sections)
     header["total_length"] = offset
     before = header.tobytes()[:-4]
     header["checksum"] = zlib.crc32(table.tobytes(), zlib.crc32(before))

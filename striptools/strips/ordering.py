@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from striptools.errors import UsageError
-from striptools.partition.sah import LARGEST_BLOCK, SMALLEST_BLOCK
+from striptools.partition.sah import SMALLEST_BLOCK
 from striptools.types import Counts, FaceIds, Faces
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from striptools.partition.object_split import ObjectTree
 
 LARGEST_LENGTH = 2**30
+LARGEST_STRIP_BLOCK = 256
+"""What the scene file can hold in a block: so many triangles, and so many vertices."""
 
 Method = Literal["strip-rt", "paper", "stripe", "tipsify"]
 EffortName = Literal["fast", "normal", "best"]
@@ -65,8 +67,9 @@ class OrderingOptions:
         effort: How long `strip-rt` searches: `fast`, `normal` or `best` (strips/tunnelling.py).
         distance_weight: Weight of nearness in the tree, 0 or more; looked at by `paper`.
         balance_weight: Weight of equal lengths, 0 or more; looked at by `paper`.
-        block: Cut the mesh into blocks of at most so many triangles and as many vertices first, 4 to
-            65536, and order inside them; looked at by `strip-rt`. None for no blocks.
+        block: The most triangles, and the most vertices, of a block, 4 to 256. `strip-rt` cuts the mesh into
+            blocks first and orders inside them; None orders in larger chunks, and what is ordered so, or by
+            another method, is grouped into blocks afterwards.
     """
 
     max_length: int = 128
@@ -74,17 +77,17 @@ class OrderingOptions:
     effort: EffortName = "normal"
     distance_weight: float = 0.5
     balance_weight: float = 0.5
-    block: int | None = None
+    block: int | None = LARGEST_STRIP_BLOCK
 
     def __post_init__(self) -> None:
         for name, value, allowed in (("method", self.method, METHODS), ("effort", self.effort, EFFORT_NAMES)):
             if value not in allowed:
                 raise UsageError(f"{value!r} is not known", where=name, remedy=f"give {', '.join(allowed)}")
-        if self.block is not None and not SMALLEST_BLOCK <= self.block <= LARGEST_BLOCK:
+        if self.block is not None and not SMALLEST_BLOCK <= self.block <= LARGEST_STRIP_BLOCK:
             raise UsageError(
                 f"{self.block} is out of range",
                 where="block",
-                remedy=f"give {SMALLEST_BLOCK} to {LARGEST_BLOCK}",
+                remedy=f"give {SMALLEST_BLOCK} to {LARGEST_STRIP_BLOCK}",
             )
         if not 1 <= self.max_length <= LARGEST_LENGTH:
             raise UsageError(

@@ -39,6 +39,7 @@ import numpy as np
 from striptools.errors import UsageError
 from striptools.kernels import classic_strips as classic
 from striptools.kernels import strip_topology as kernels
+from striptools.kernels.blocks import fan_starts
 from striptools.strips.ordering import Sequences
 from striptools.threads import SMALLEST_CHUNK, in_chunks
 from striptools.types import Bools, Counts, FaceIds, Faces, Rotations
@@ -60,6 +61,7 @@ class Strips:
         source_face: (n,) int32, the face each triangle was.
         rotation: (n,) uint8, places its corners were turned to the left: decoded[j] = source[(j + rotation)
         % 3].
+        flips: (n,) bool, the flip bit of each triangle, or None where none is set.
     """
 
     vertices: Counts
@@ -67,6 +69,7 @@ class Strips:
     starts: Counts
     source_face: FaceIds
     rotation: Rotations
+    flips: Bools | None = None
 
 
 def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strips:
@@ -95,6 +98,26 @@ def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strip
     )
     _refuse_break(next((place for place in broken if place >= 0), -1), "encode_strips")
     return Strips(vertices, turns, starts, order, rotation)
+
+
+def split_fans(strips: Strips, faces: Faces, threads: int = 1) -> Strips:
+    """The same triangles in the same order, strips cut where more than 30 turn bits in a row are equal.
+
+    The scene file asks for it, so that a triangle's corners follow from 32 turn bits. Only strips round a
+    vertex of many faces are that long.
+
+    Args:
+        strips: Of `encode_strips`.
+        faces: (n, 3) int32, those that they were made of.
+        threads: How many threads encode what was cut.
+    """
+    while True:
+        is_first = np.zeros(len(strips.turns), np.bool_)
+        if fan_starts(strips.turns, strips.starts, is_first) == len(strips.starts) - 1:
+            return strips
+        # The second turn bit of a new strip is 0 whatever it was, so the strips are looked at again.
+        starts = np.append(np.flatnonzero(is_first), len(is_first)).astype(np.int32)
+        strips = encode_strips(faces, Sequences(strips.source_face, starts), threads)
 
 
 def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int = 1) -> Faces:

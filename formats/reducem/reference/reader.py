@@ -1,0 +1,588 @@
+"""Read a ReduceM scene file, format 0.3: the reference reader, written from SPEC.md alone.
+
+It is slow and plain on purpose, needs nothing but the standard library and shares no code with striptools.
+Every refusal is a `RefusedError` that names the clause of SPEC.md. It reads raw sections; where an archive
+(codec 1) needs a Zstandard decoder it says so. It checks what sections 3 to 6 rule, but not whether the boxes
+of nodes hold what is below them: it decodes them, and a validator looks.
+
+    python reader.py FILE          print a summary
+    python reader.py --obj FILE    print a Wavefront OBJ of the triangles, in the order of the file
+"""
+
+import json
+import math
+import struct
+import sys
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MAGIC = b"\x89RDM\r\n\x1a\n"
+MUST_UNDERSTAND = {"SCEN": 1, "BLKH": 1, "BLKD": 1, "NODE": 1, "RUNS": 1, "RMAP": 0, "META": 0}
+MOST_DEEP = 32
+"""Levels of arrays and objects in metadata."""
+
+
+class RefusedError(Exception):
+    """The file is not read; `clause` is the section of SPEC.md that says why."""
+
+    def __init__(self, clause, what):
+        self.clause = clause
+        super().__init__(f"SPEC {clause}: {what}")
+
+
+@dataclass
+class Node:
+    """A node: what is in its slots 0 to 7.
+
+    `children` has `("empty",)`, `("node", i)`, `("block", i)` or `("run", block, i)` for each slot; `boxes`
+    has None or, for each axis, two integers L and H: the box goes from low + 2^cell * L to low + 2^cell * H.
+    """
+
+    children: list
+    boxes: list
+
+
+@dataclass
+class Scene:
+    """A decoded file.
+
+    Attributes:
+        record: The fields of SCEN by their names; floats as floats.
+        vertices: The vertices of all blocks in a row, each the three 32-bit patterns of its floats.
+        faces: The triangles in the order of the file, each three numbers of `vertices`.
+        block_starts: The first triangle of each block, and n.
+        remap: `(face, rotation)` of each triangle, or None.
+        nodes: The nodes in their order.
+        runs: For each block its runs `(first triangle, triangles)`; None where boxes are not stored.
+        metadata: The object of META; empty where there is none.
+        passed_over: The kinds of sections that this reader does not know.
+    """
+
+    record: dict
+    vertices: list = field(default_factory=list)
+    faces: list = field(default_factory=list)
+    block_starts: list = field(default_factory=lambda: [0])
+    remap: list | None = None
+    nodes: list = field(default_factory=list)
+    runs: list | None = None
+    metadata: dict = field(default_factory=dict)
+    passed_over: list = field(default_factory=list)
+
+
+def read(data):
+    """Decode a whole file.
+
+    Args:
+        data: The bytes of the file.
+
+    Raises:
+        RefusedError: The file is not valid, or needs something that is not here.
+    """
+    sections, passed_over = read_container(bytes(data))
+    if "SCEN" not in sections:
+        raise RefusedError("4", "there is no section SCEN")
+    record = read_record(sections["SCEN"])
+    check_lengths(record, sections)
+    scene = Scene(record, passed_over=passed_over)
+    read_blocks(scene, sections.get("BLKH", b""), sections.get("BLKD", b""))
+    check_bounds(scene)
+    if record["stored"]:
+        scene.runs = read_runs(scene, sections["RUNS"])
+    scene.nodes = [read_node(scene, i, sections["NODE"]) for i in range(record["node_count"])]
+    check_nodes(scene)
+    if "RMAP" in sections:
+        scene.remap = read_remap(record, sections["RMAP"])
+    if "META" in sections:
+        scene.metadata = read_metadata(sections["META"])
+    return scene
+
+
+# Section 3: the container
+
+
+def read_container(data):
+    """The raw bytes of each known section by its kind, and the kinds of the others."""
+    count = read_header(data)
+    sections, passed_over = {}, []
+    kinds = set()
+    end = 32 + 40 * count
+    for i in range(count):
+        entry = struct.unpack_from("<4sHHQQQII", data, 32 + 40 * i)
+        kind = entry[0].decode("latin-1")
+        if kind in kinds:
+            raise RefusedError("3.2", f"{kind!r} is there twice")
+        kinds.add(kind)
+        payload = read_section(data, end, kind, *entry[1:])
+        end = entry[3] + entry[4]
+        if kind in MUST_UNDERSTAND:
+            sections[kind] = payload
+        else:
+            passed_over.append(kind)
+    if align(end) != len(data) or any(data[end:]):
+        raise RefusedError("3.3", "the file does not end where its last section does, in zero bytes")
+    return sections, passed_over
+
+
+def read_header(data):
+    """The number of sections of a file whose header and table are whole."""
+    if data[:8] != MAGIC[: len(data)]:
+        raise RefusedError("3.1", "the first bytes are not those of a scene file")
+    if len(data) < 32:
+        raise RefusedError("3.1", "the file ends inside its header")
+    major, minor, count, total, reserved, checksum = struct.unpack_from("<HHIQII", data, 8)
+    if (major, minor) != (0, 3):
+        raise RefusedError("7", f"version {major}.{minor} is not 0.3")
+    if total != len(data) or total % 64:
+        raise RefusedError("3.1", f"the file has {len(data)} bytes, not the {total} of its header")
+    if not 1 <= count <= 64 or 32 + 40 * count > len(data):
+        raise RefusedError("3.1", f"{count} sections")
+    if zlib.crc32(data[:28] + data[32 : 32 + 40 * count]) != checksum:
+        raise RefusedError("3.1", "the checksum of header and table does not fit")
+    if reserved:
+        raise RefusedError("3.1", "the reserved field is not zero")
+    return count
+
+
+def read_section(data, end, kind, flags, codec, offset, stored_length, raw_length, stored_sum, raw_sum):
+    """The bytes of one section, which begins after byte `end`."""
+    if flags > 1:
+        raise RefusedError("3.2", f"{kind!r}: a reserved flag is set")
+    if flags != MUST_UNDERSTAND.get(kind, 0):
+        raise RefusedError("3.2", f"{kind!r}: must be understood and is not known, or has the wrong flag")
+    if stored_length < 1 or raw_length < 1:
+        raise RefusedError("3.2", f"{kind!r}: a section of no bytes")
+    if offset != align(end) or offset + stored_length > len(data):
+        raise RefusedError("3.3", f"{kind!r}: out of its place")
+    if any(data[end:offset]):
+        raise RefusedError("3.3", f"{kind!r}: the padding before it is not zero")
+    stored = data[offset : offset + stored_length]
+    if zlib.crc32(stored) != stored_sum:
+        raise RefusedError("3.2", f"{kind!r}: the checksum does not fit")
+    if codec == 0 and (raw_length, raw_sum) != (stored_length, stored_sum):
+        raise RefusedError("3.2", f"{kind!r}: raw, but with two lengths or checksums")
+    if codec and kind in MUST_UNDERSTAND:
+        need = "a Zstandard decoder" if codec == 1 else "a newer reader"
+        raise RefusedError("6", f"{kind!r}: has codec {codec} and needs {need}; this reads raw sections only")
+    return stored
+
+
+def align(x):
+    """The least multiple of 64 that is not below x."""
+    return (x + 63) // 64 * 64
+
+
+# Section 4.1: the scene record
+
+RECORD = struct.Struct("<6IBBhId6f3hH24s")
+FIELDS = (
+    *("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count"),
+    *("flags", "reserved", "grid_exponent", "reserved_2", "error_bound"),
+    *("low_x", "low_y", "low_z", "high_x", "high_y", "high_z", "cell_x", "cell_y", "cell_z"),
+    *("longest_run", "reserved_3"),
+)
+
+
+def read_record(payload):
+    """The fields of SCEN by name, with `stored` and `grid` for the two flags, and `low`, `high`, `cell`."""
+    if len(payload) != RECORD.size:
+        raise RefusedError("4.1", f"SCEN has {len(payload)} bytes")
+    record = dict(zip(FIELDS, RECORD.unpack(payload), strict=True))
+    record["stored"], record["grid"] = record["flags"] & 1, record["flags"] >> 1 & 1
+    record["low"] = [record[f"low_{axis}"] for axis in "xyz"]
+    record["high"] = [record[f"high_{axis}"] for axis in "xyz"]
+    record["cell"] = [record[f"cell_{axis}"] for axis in "xyz"]
+    if record["flags"] > 3 or record["reserved"] or record["reserved_2"] or any(record["reserved_3"]):
+        raise RefusedError("4.1", "a reserved field is not zero")
+    if not (math.isfinite(record["error_bound"]) and record["error_bound"] >= 0):
+        raise RefusedError("4.1", "the error bound is negative or not finite")
+    if not (-149 <= record["grid_exponent"] <= 104 if record["grid"] else record["grid_exponent"] == 0):
+        raise RefusedError("4.1", "the grid exponent is out of its range")
+    if not all(-149 <= cell <= 127 for cell in record["cell"]):
+        raise RefusedError("4.1", "a cell exponent is out of its range")
+    check_counts(record)
+    if record["triangle_count"] == 0:
+        check_empty(record, payload)
+    return record
+
+
+def check_counts(record):
+    """Refuse counts that no scene can have."""
+    n, b, m = record["triangle_count"], record["block_count"], record["node_count"]
+    top, r, longest = record["top_count"], record["run_count"], record["longest_run"]
+    wrong = b > 2**24 or m > 2**28 or (b == 0) != (n == 0) or not b <= n <= 256 * b
+    wrong = wrong or record["source_face_count"] < n or (top == 0) != (b < 2)
+    if record["stored"]:
+        wrong = wrong or m < top + b or not b <= r <= n or not 1 <= longest <= 8
+    else:
+        wrong = wrong or m != top or r != 0 or longest != 0
+    if wrong:
+        raise RefusedError("4.1", "the counts do not agree with each other")
+
+
+def check_empty(record, payload):
+    """Refuse an empty scene with anything in it."""
+    if record["stored"] or any(payload[40:70]):
+        raise RefusedError("4.1", "an empty scene with stored boxes, bounds or cells")
+
+
+def check_lengths(record, sections):
+    """Refuse sections that are missing, not needed, or of another length than the counts give."""
+    n, b, m, r = (record[name] for name in ("triangle_count", "block_count", "node_count", "run_count"))
+    lengths = {"SCEN": 96, "BLKH": 32 * b, "NODE": 64 * m, "RUNS": 4 * b + 2 * r if record["stored"] else 0}
+    if "RMAP" in sections:
+        lengths["RMAP"] = 4 * n + -(-n // 4)
+    for kind, length in lengths.items():
+        if len(sections.get(kind, b"")) != length:
+            raise RefusedError("4.1", f"{kind} has another length than the counts give it")
+        if kind in sections and not length:
+            raise RefusedError("4", f"{kind} is there and not needed")
+    if ("BLKD" in sections) != (n > 0):
+        raise RefusedError("4", "BLKD is missing, or there and not needed")
+
+
+# Sections 4.2 and 4.3: blocks
+
+
+def read_blocks(scene, headers, data):
+    """Decode all blocks into `scene.vertices` and `scene.faces`."""
+    word = 0
+    for i in range(scene.record["block_count"]):
+        header = struct.unpack_from("<IIBBBB3i3B3BH", headers, 32 * i)
+        if header[0] != len(scene.faces) or header[1] != word:
+            raise RefusedError("4.2", f"block {i} begins at another triangle or word")
+        try:
+            word = read_block(scene, header, data, word)
+        except RefusedError as refusal:
+            raise RefusedError(refusal.clause, f"block {i}: {refusal}") from None
+        scene.block_starts.append(len(scene.faces))
+    if len(scene.faces) != scene.record["triangle_count"]:
+        raise RefusedError("4.1", "the blocks have more or fewer triangles than the scene")
+    if data and (len(data) != align(4 * (word + 16)) or any(data[4 * word :])):
+        raise RefusedError("4.2", "the block data do not end in 16 words of zero and none too many")
+
+
+def read_block(scene, header, data, word):
+    """Decode one block; gives the word after its end."""
+    k, q, s, flags = header[2] + 1, header[3] + 1, header[4] + 1, header[5]
+    axes = list(zip(header[6:9], header[9:12], header[12:15], strict=True))
+    c = k + 2 * s
+    if q < 3 or s > k or q > c or flags > 1 or header[15]:
+        raise RefusedError("4.2", "a count is out of its range, or a reserved field is not zero")
+    check_axes(axes)
+    w = (q - 1).bit_length()
+    bits = (2 + flags) * k + c * w + q * sum(axis & 63 for _, axis, _ in axes)
+    end = word + -(-bits // 32)
+    if 4 * end > len(data):
+        raise RefusedError("4.2", "the data end inside the block")
+    stream = int.from_bytes(data[4 * word : 4 * end], "little")
+    if stream >> bits:
+        raise RefusedError("4.2", "the last word is not filled up with zero bits")
+    starts, turns = ([stream >> p + t & 1 for t in range(k)] for p in (0, k))
+    flips = [stream >> 2 * k + t & 1 for t in range(k)] if flags else [0] * k
+    check_strips(s, starts, turns, flips, flags)
+    p = (2 + flags) * k
+    index = [stream >> p + i * w & (1 << w) - 1 for i in range(c)]
+    check_indices(index, q)
+    first = len(scene.vertices)
+    scene.vertices += read_vertices(stream >> p + c * w, q, axes)
+    scene.faces += [[first + corner for corner in face] for face in read_faces(starts, turns, flips, index)]
+    return end
+
+
+def check_axes(axes):
+    """Refuse widths, modes and exponents that are out of their range."""
+    for _, axis, exponent in axes:
+        width, mode = axis & 63, axis >> 6
+        if width > 32 or mode > 2 or (mode == 1 and width == 0) or (mode == 2 and exponent):
+            raise RefusedError("4.2", "a width, mode or exponent is out of its range")
+
+
+def check_strips(s, starts, turns, flips, flags):
+    """Refuse start, turn and flip bits that make no strips."""
+    if not starts[0] or sum(starts) != s:
+        raise RefusedError("4.3", "the start bits do not begin as many strips as the header says")
+    if any(start and (turn or flip) for start, turn, flip in zip(starts, turns, flips, strict=True)):
+        raise RefusedError("4.3", "the first triangle of a strip turns or is flipped")
+    if flags and not any(flips):
+        raise RefusedError("4.3", "there are flip bits and none is set")
+    equal = 0
+    for t in range(1, len(starts)):
+        goes_on = not starts[t] and not starts[t - 1] and turns[t] == turns[t - 1]
+        equal = equal + 1 if goes_on else 1
+        if equal > 30 and not starts[t]:
+            raise RefusedError("4.3", "more than 30 turn bits in a row are equal")
+
+
+def check_indices(index, q):
+    """Refuse indices that are not in the order of their first use, or leave a vertex out."""
+    used = 0
+    for i in index:
+        if i > used or i >= q:
+            raise RefusedError("4.3", "the indices are not in the order of their first use, or too large")
+        used = max(used, i + 1)
+    if used != q:
+        raise RefusedError("4.3", "a vertex is not used")
+
+
+def read_faces(starts, turns, flips, index):
+    """The triangles of a block, by the loop of section 4.3."""
+    faces = []
+    i = -1
+    a = b = c = 0
+    for t, start in enumerate(starts):
+        if start:
+            i += 1
+            a, b, c = index[t + 2 * i : t + 2 * i + 3]
+        else:
+            w = index[t + 2 * i + 2]
+            a, b, c = (a, c, w) if turns[t] else (c, b, w)
+        if a in (b, c) or b == c:
+            raise RefusedError("4.3", f"triangle {t} names one vertex twice")
+        faces.append((b, a, c) if flips[t] else (a, b, c))
+    return faces
+
+
+def read_vertices(stream, q, axes):
+    """The vertices of a block from the stream of their numbers: q rows of three bit patterns."""
+    vertices = []
+    for _ in range(q):
+        vertex = []
+        for anchor, axis, exponent in axes:
+            width, mode = axis & 63, axis >> 6
+            u = stream & (1 << width) - 1
+            stream >>= width
+            vertex.append(coordinate(anchor, u, width, mode, exponent - 149))
+        vertices.append(tuple(vertex))
+    return vertices
+
+
+def coordinate(anchor, u, width, mode, e):
+    """The bit pattern of one coordinate."""
+    i = anchor + u
+    if mode == 2:
+        bits = i if i >= 0 else 0x80000000 + (-1 - i)
+        if (i if i >= 0 else -1 - i) >= 0x7F800000:
+            raise RefusedError("4.3", "a coordinate is not finite")
+        return bits
+    if mode == 1 and u == (1 << width) - 1:
+        return 0x80000000
+    value = math.ldexp(i, e)
+    try:
+        bits = struct.pack("<f", value)
+    except OverflowError:
+        raise RefusedError("4.3", "a coordinate is not finite") from None
+    if not -(2**31) < i < 2**31 or struct.unpack("<f", bits)[0] != value:
+        raise RefusedError("4.3", "a coordinate is out of its range or no float32")
+    return int.from_bytes(bits, "little")
+
+
+def as_float(bits):
+    """The number that a 32-bit pattern stands for."""
+    return struct.unpack("<f", bits.to_bytes(4, "little"))[0]
+
+
+def check_bounds(scene):
+    """Refuse low and high that are not the positions' own, and coordinates that are not on the grid."""
+    record = scene.record
+    for axis in range(3 if scene.vertices else 0):
+        values = [as_float(vertex[axis]) for vertex in scene.vertices]
+        # Adding 0.0 turns -0.0 into 0.0.
+        wanted = struct.pack("<ff", min(values) + 0.0, max(values) + 0.0)
+        if struct.pack("<ff", record["low"][axis], record["high"][axis]) != wanted:
+            raise RefusedError("4.1", "low and high are not the bounds of the positions")
+        if record["grid"] and any(math.ldexp(x, -record["grid_exponent"]) % 1 for x in values):
+            raise RefusedError("4.1", "a coordinate is not on the grid")
+
+
+# Sections 4.4 and 4.5: nodes and runs
+
+
+def read_runs(scene, payload):
+    """For each block its runs `(first triangle, triangles)`."""
+    b, r = scene.record["block_count"], scene.record["run_count"]
+    starts = [*struct.unpack_from(f"<{b}I", payload), r]
+    words = struct.unpack_from(f"<{r}H", payload, 4 * b)
+    if starts[0] != 0 or any(starts[i] > starts[i + 1] for i in range(b)):
+        raise RefusedError("4.5", "the runs of the blocks are not in their order")
+    runs = []
+    for i in range(b):
+        here = words[starts[i] : starts[i + 1]]
+        if any(word >> 11 for word in here):
+            raise RefusedError("4.5", "a reserved bit of a run is not zero")
+        runs.append([(word & 255, (word >> 8) + 1) for word in here])
+        check_runs(scene, i, runs[-1])
+    return runs
+
+
+def check_runs(scene, block, runs):
+    """Refuse runs that are too long, or do not have each triangle of the block once."""
+    triangles = [t for first, count in runs for t in range(first, first + count)]
+    if sorted(triangles) != list(range(scene.block_starts[block + 1] - scene.block_starts[block])):
+        raise RefusedError("4.5", f"block {block}: not every triangle is in exactly one run")
+    if any(count > scene.record["longest_run"] for _, count in runs):
+        raise RefusedError("4.5", f"block {block}: a run is longer than the longest")
+
+
+def read_node(scene, number, payload):
+    """Node `number`: what its slots name, and their boxes."""
+    base, leaves, *origin, inner, shifts = struct.unpack_from("<II3HBB", payload, 64 * number)
+    planes = struct.unpack_from("<48B", payload, 64 * number + 16)
+    shift = (base >> 28, shifts & 15, shifts >> 4)
+    base &= 2**28 - 1
+    is_top = number < scene.record["top_count"]
+    node = Node([], [])
+    inners = leaf = 0
+    for slot in range(8):
+        low, high = planes[slot:24:8], planes[24 + slot :: 8]
+        is_inner = inner >> slot & 1
+        if is_inner:
+            node.children.append(("node", base + inners))
+            inners += 1
+        elif (low, high) == ((1, 1, 1), (0, 0, 0)):
+            node.children.append(("empty",))
+            node.boxes.append(None)
+            continue
+        else:
+            child = ("block", leaves + leaf) if is_top else ("run", leaves & 2**24 - 1, (leaves >> 24) + leaf)
+            node.children.append(child)
+            leaf += 1
+        if any(low[axis] > high[axis] for axis in range(3)):
+            raise RefusedError("4.4", f"node {number}: slot {slot} has a box inside out")
+        node.boxes.append(
+            [(origin[x] + (low[x] << shift[x]), origin[x] + (high[x] << shift[x])) for x in range(3)]
+        )
+    if (base and not inners) or (leaves and not leaf) or inners + leaf == 0:
+        raise RefusedError("4.4", f"node {number}: base or leaves without such a child, or no child at all")
+    return node
+
+
+def check_nodes(scene):
+    """Refuse nodes that do not reach each node, block and run once."""
+    top, b = scene.record["top_count"], scene.record["block_count"]
+    parents = {}
+    home = {top + i: i for i in range(b)}
+    for number, node in enumerate(scene.nodes):
+        for child in node.children:
+            if child[0] == "empty":
+                continue
+            if child in parents:
+                raise RefusedError("4.4", f"node {number}: {child} has two parents")
+            parents[child] = number
+            if child[0] == "node" and not number < child[1] < (top if number < top else len(scene.nodes)):
+                raise RefusedError("4.4", f"node {number}: an inner child is not where it must be")
+            if child[0] == "node" and number >= top:
+                home[child[1]] = home.get(number)
+            if child[0] == "run" and child[1] != home.get(number):
+                raise RefusedError("4.4", f"node {number}: is not a node of block {child[1]}")
+    wanted = {("node", i) for i in range(1, top)} | {("node", i) for i in range(top + b, len(scene.nodes))}
+    wanted |= {("block", i) for i in range(b if top else 0)}
+    wanted |= {("run", i, j) for i, runs in enumerate(scene.runs or []) for j in range(len(runs))}
+    if set(parents) != wanted:
+        raise RefusedError("4.4", "a node, block or run has no parent, or should have none")
+
+
+# Sections 4.6 and 4.7: remap and metadata
+
+
+def read_remap(record, payload):
+    """`(face, rotation)` of each triangle."""
+    n = record["triangle_count"]
+    faces = struct.unpack_from(f"<{n}I", payload)
+    rotations = [payload[4 * n + t // 4] >> 2 * (t % 4) & 3 for t in range(len(payload[4 * n :]) * 4)]
+    if any(face >= record["source_face_count"] for face in faces) or len(set(faces)) < n:
+        raise RefusedError("4.6", "a face is not in the source, or is there twice")
+    if any(r > 2 for r in rotations[:n]) or any(rotations[n:]):
+        raise RefusedError("4.6", "a rotation is not 0, 1 or 2, or an unused bit is set")
+    return list(zip(faces, rotations[:n], strict=True))
+
+
+def read_metadata(payload):
+    """The object of META."""
+    if len(payload) > 2**20:
+        raise RefusedError("4.7", "more than 2^20 bytes")
+    try:
+        text = payload.decode("utf-8")
+        check_depth(text)
+        # Numbers are kept as they are written: no number of digits is too large.
+        metadata = json.loads(text, parse_int=str, parse_float=str, parse_constant=refuse_constant)
+    except ValueError as error:
+        raise RefusedError("4.7", f"no JSON in UTF-8: {error}") from None
+    if not isinstance(metadata, dict):
+        raise RefusedError("4.7", "no JSON object")
+    if not all(isinstance(metadata.get(name, ""), str) for name in ("generator", "source", "unit")):
+        raise RefusedError("4.7", "generator, source or unit is no string")
+    return metadata
+
+
+def check_depth(text):
+    """Refuse arrays and objects nested too deep, before anything follows them down."""
+    depth, in_string, escaped = 0, False, False
+    for letter in text:
+        if in_string:
+            in_string = escaped or letter != '"'
+            escaped = letter == "\\" and not escaped
+        elif letter == '"':
+            in_string = True
+        elif letter in "[{":
+            depth += 1
+        elif letter in "]}":
+            depth -= 1
+        if depth > MOST_DEEP:
+            raise RefusedError("4.7", f"nested deeper than {MOST_DEEP}")
+
+
+def refuse_constant(name):
+    """Refuse what Python takes for JSON and JSON does not."""
+    raise ValueError(f"{name} is no JSON")
+
+
+# The command line
+
+
+def summary(scene):
+    """A few lines of what is in the scene."""
+    record = scene.record
+    kinds = [child[0] for node in scene.nodes for child in node.children]
+    facts = {
+        "triangles": record["triangle_count"],
+        "block vertices": len(scene.vertices),
+        "blocks": record["block_count"],
+        "nodes": f"{record['node_count']}, {record['top_count']} of them over blocks",
+        "boxes": f"stored, {kinds.count('run')} runs" if record["stored"] else "rebuilt by the reader",
+        "source faces": record["source_face_count"],
+        "low": record["low"],
+        "high": record["high"],
+        "error bound": record["error_bound"],
+        "grid": f"2^{record['grid_exponent']}" if record["grid"] else "none",
+        "remap": "yes" if scene.remap else "no",
+        "metadata": ascii(scene.metadata),
+        "passed over": ascii(scene.passed_over),
+    }
+    return "".join(f"{name}: {value}\n" for name, value in facts.items())
+
+
+def wavefront(scene):
+    """The text of a Wavefront OBJ; nine digits give a float32 back."""
+    lines = ["v " + " ".join(f"{as_float(bits):.9g}" for bits in vertex) for vertex in scene.vertices]
+    lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in scene.faces]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def main(arguments):
+    """Run the command line; gives the exit code: 0, 1 for a file that is refused, 2 for a wrong call."""
+    options, paths = [a for a in arguments if a == "--obj"], [a for a in arguments if a != "--obj"]
+    if len(paths) != 1:
+        sys.stderr.write("usage: python reader.py [--obj] FILE\n")
+        return 2
+    try:
+        scene = read(Path(paths[0]).read_bytes())
+    except (RefusedError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.write(wavefront(scene) if options else summary(scene))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
