@@ -80,15 +80,20 @@ def _rounded_middle(low: float, high: float) -> float:
     return round(middle / unit) * unit
 
 
-def _moved(source: np.ndarray, origin: Origin) -> tuple[Positions, np.ndarray]:
-    """Positions less the origin in float32, and how far each coordinate then is from its source.
+def displacement(source: np.ndarray, origin: Origin, positions: np.ndarray) -> np.ndarray:
+    """How far `origin + positions` is from the source, all of one shape, the origin's last axis x, y, z.
 
-    The subtraction's own error is its two-sum remainder (Knuth, TAOCP 2, 4.2.2).
+    The error of taking the origin away is its two-sum remainder (Knuth, TAOCP 2, 4.2.2); what is left is one
+    subtraction's rounding.
     """
+    difference = source - origin
+    taken = difference - source
+    lost = (source - (difference - taken)) - (origin + taken)
+    return (positions - difference) - lost
+
+
+def _moved(source: np.ndarray, origin: Origin) -> tuple[Positions, np.ndarray]:
+    """Positions less the origin in float32, and how far each coordinate then is from its source."""
     with np.errstate(all="ignore"):
-        difference = source - origin
-        taken = difference - source
-        lost = (source - (difference - taken)) - (origin + taken)
-        moved = difference.astype(np.float32)
-        change = np.abs((moved - difference) - lost)
-    return moved, change * (1 + 2.0**-50)
+        moved = (source - origin).astype(np.float32)
+        return moved, np.abs(displacement(source, origin, moved)) * (1 + 2.0**-50)
