@@ -175,10 +175,7 @@ class Scene:
 
     @cached_property
     def _faces(self) -> Faces:
-        faces = decode_strips(self.vertices, self.turns, self.starts, threads=every_core())
-        if self.flips is not None:
-            faces[self.flips, :2] = faces[self.flips, 1::-1]
-        return faces
+        return decode_strips(self.vertices, self.turns, self.starts, self.flips, threads=every_core())
 
     def faces(self) -> Faces:
         """Decode the strips, once; later calls give the same array.
@@ -187,6 +184,11 @@ class Scene:
             (n, 3) int32 triangles in file order, with the source's winding: places in `positions`.
         """
         return self._faces
+
+    @cached_property
+    def leaders(self) -> Counts:
+        """(q,) int32, for each vertex the first one that equals it bit for bit."""
+        return weld_vertices(self.positions, threads=every_core())[0]
 
     def triangle_boxes(self, threads: int | None = None) -> Boxes:
         """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
@@ -235,7 +237,7 @@ class Scene:
             order = np.argsort(self.remap.face, kind="stable").astype(np.int32)
             faces = np.take_along_axis(faces, back, axis=1)
             attributes = tuple(_turned(one, back) for one in attributes)
-        leader, _ = weld_vertices(self.positions, threads=every_core())
+        leader = self.leaders
         is_leader = leader == np.arange(len(leader), dtype=np.int32)
         place = np.cumsum(is_leader, dtype=np.int32) - np.int32(1)
         welded = np.ascontiguousarray(place[leader[faces[order]]])

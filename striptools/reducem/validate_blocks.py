@@ -140,6 +140,7 @@ def _places(inspection: Inspection, blocks: _Blocks) -> None:
     length = -(-blocks.bits // 32)
     word = np.cumsum(length) - length
     inspection.found_where("RDM601", blocks.first != first, place, lambda i: headers.at(32 * i))
+    blocks.whole &= blocks.word == word
     if inspection.found_where("RDM602", blocks.word != word, place, lambda i: headers.at(32 * i + 4)):
         return
     end = int(length.sum())
@@ -260,7 +261,7 @@ def _indices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.n
     largest = np.maximum.accumulate(index + 1 + 1024 * row) - 1024 * row
     before = np.where(j == 0, 0, np.concatenate([[0], largest[:-1]]))
     check("RDM612", index > before)
-    used = np.bincount(np.unique(256 * row + index) // 256, minlength=len(chunk))
+    used = np.bincount(np.unique((256 * row + index)[index < q[row]]) // 256, minlength=len(chunk))
     inspection.found_where(
         "RDM613",
         used < q,

@@ -35,7 +35,7 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The nodes, and of each slot, (m, 8), whether it is inner or a leaf, and which one it names."""
+    """The nodes, and for each slot, (m, 8), whether it is inner, a leaf or a sound box, and what it names."""
 
     section: Section
     rows: np.ndarray
@@ -43,6 +43,7 @@ class _Nodes:
     blocks: int
     is_inner: np.ndarray
     is_leaf: np.ndarray
+    is_box: np.ndarray
     child: np.ndarray
     leaf: np.ndarray
 
@@ -68,6 +69,7 @@ def inspect_nodes(inspection: Inspection, geometry: Geometry) -> None:
     sound = _blocks(inspection, nodes)
     if runs is not None and parents is not None:
         sound = _leaves(inspection, nodes, parents, runs) and sound
+    sound = sound and (nodes.is_inner | nodes.is_leaf).any(axis=1).all()
     if sound and parents is not None:
         _boxes(inspection, nodes, geometry, runs)
 
@@ -131,7 +133,7 @@ def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
     child = base[:, None] + np.cumsum(is_inner, axis=1) - 1
     first = np.where(np.arange(len(rows)) < top, leaves, leaves >> 24)
     leaf = first[:, None] + np.cumsum(is_leaf, axis=1) - 1
-    return _Nodes(section, rows, top, blocks, is_inner, is_leaf, child, leaf)
+    return _Nodes(section, rows, top, blocks, is_inner, is_leaf, ~is_empty & ~inverted, child, leaf)
 
 
 def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
@@ -212,8 +214,7 @@ def _boxes(inspection: Inspection, nodes: _Nodes, geometry: Geometry, runs: _Run
         return
     low, high = _content(nodes, geometry, runs)
     shift = np.stack([nodes.rows["base"] >> 28, nodes.rows["shifts"] & 15, nodes.rows["shifts"] >> 4], axis=1)
-    taken = nodes.is_inner | nodes.is_leaf
-    leaking = np.zeros(taken.shape, np.bool_)
+    leaking = np.zeros(nodes.is_box.shape, np.bool_)
     for axis in range(3):
         origin, scale = nodes.rows["origin"][:, axis].astype(np.int64), shift[:, axis].astype(np.int64)
         planes = (
@@ -227,7 +228,7 @@ def _boxes(inspection: Inspection, nodes: _Nodes, geometry: Geometry, runs: _Run
         leaking |= (below < 0) | (above > 0)
     inspection.found_where(
         "RDM707",
-        (leaking & taken).ravel(),
+        (leaking & nodes.is_box).ravel(),
         lambda i: f"NODE: node {i // 8}, slot {i % 8}",
         lambda i: nodes.section.at(64 * (i // 8) + 16 + i % 8),
     )

@@ -57,7 +57,7 @@ def stripify_in_blocks(
         cut = cut_for(tree, faces, vertex_count, options)
         effort = EFFORTS[options.effort]
         given = (faces, vertex_count, boxes, tree, cut, options.max_length, effort)
-        return order_cut(*given, threads, watch), cut.starts
+        return order_cut(*given, threads, watch, flips=options.flips), cut.starts
     sequences = stripify(faces, vertex_count, boxes, tree, options, threads, watch)
     most = options.block or LARGEST_STRIP_BLOCK
     return group_sequences(sequences, faces, vertex_count, boxes, most, partition, threads)

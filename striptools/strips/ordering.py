@@ -70,6 +70,8 @@ class OrderingOptions:
         block: The most triangles, and the most vertices, of a block, 4 to 256. `strip-rt` cuts the mesh into
             blocks first and orders inside them; None orders in larger chunks, and what is ordered so, or by
             another method, is grouped into blocks afterwards.
+        flips: Let strips cross edges that both faces run the same way, where that makes the scene smaller;
+            looked at by `strip-rt`.
     """
 
     max_length: int = 128
@@ -78,6 +80,7 @@ class OrderingOptions:
     distance_weight: float = 0.5
     balance_weight: float = 0.5
     block: int | None = LARGEST_STRIP_BLOCK
+    flips: bool = True
 
     def __post_init__(self) -> None:
         for name, value, allowed in (("method", self.method, METHODS), ("effort", self.effort, EFFORT_NAMES)):
@@ -103,7 +106,8 @@ class OrderingOptions:
 class Sequences:
     """Faces in strip order.
 
-    Each face stands once; neighbours in a sequence share an edge that they run in opposite directions.
+    Each face stands once; neighbours in a sequence share an edge. They run it in opposite directions unless
+    the sequence was made with flips.
 
     Attributes:
         faces: (n,) int32, the faces of all sequences one after another.
