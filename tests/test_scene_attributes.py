@@ -298,7 +298,7 @@ SPOILED = {
     "a reserved word": ("RDM107", 20, b"\1"),
     "a reserved head": ("RDM107", 4, b"\1"),
     "no attribute": ("RDM521", 0, b"\0"),
-    "far too many": ("RDM52[12]", 0, b"\xff\xff\xff\xff"),
+    "far too many": ("RDM521", 0, b"\xff\xff\xff\xff"),
 }
 
 

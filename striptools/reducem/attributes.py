@@ -145,12 +145,16 @@ def decode_columns(raw: np.ndarray, entries: dict[Domain, int], where: str) -> t
         UnreadableSceneError: The section breaks a rule.
     """
     place = f"{where}: ATTR"
-    count, reserved = np.frombuffer(raw[: layout.ATTRIBUTES_HEAD].tobytes().ljust(8, b"\0"), "<u4").tolist()
-    at = layout.ATTRIBUTES_HEAD + count * layout.ATTRIBUTE.size
-    if not 1 <= count <= len(KINDS) or at > len(raw):
-        raise unreadable("RDM521" if at <= len(raw) or not count else "RDM522", place)
+    if len(raw) < layout.ATTRIBUTES_HEAD:
+        raise unreadable("RDM522", place)
+    count, reserved = np.frombuffer(raw[: layout.ATTRIBUTES_HEAD].tobytes(), "<u4").tolist()
+    if not 1 <= count <= len(KINDS):
+        raise unreadable("RDM521", place)
     if reserved:
         raise unreadable("RDM107", place)
+    at = layout.ATTRIBUTES_HEAD + count * layout.ATTRIBUTE.size
+    if at > len(raw):
+        raise unreadable("RDM522", place)
     columns = []
     for record in np.frombuffer(raw[layout.ATTRIBUTES_HEAD : at].tobytes(), layout.ATTRIBUTE.dtype):
         one, at = _decode_column(record, raw, at, entries, place)
