@@ -227,7 +227,9 @@ class _File:
         """The scene record, the ranges of its fields checked."""
         raw = self.section(layout.SCENE, layout.SCENE_RECORD.size)
         row = np.frombuffer(raw.tobytes(), layout.SCENE_RECORD.dtype)[0]
-        record = {name: row[name].tolist() for name in layout.SCENE_RECORD.dtype.names or ()}
+        record = {field.name: row[field.name].tolist() for field in layout.SCENE_RECORD.fields}
+        if record["triangle_count"] == 0 and raw[_BOUNDS].any():
+            raise unreadable("RDM208", f"{self.where}: SCEN")
         _check_record(record, f"{self.where}: SCEN")
         if record["triangle_count"] > MOST_TRIANGLES or record["source_face_count"] > 2**31 - 1:
             raise unreadable("RDM124", f"{self.where}: SCEN")
@@ -255,8 +257,8 @@ class _File:
         """The blocks, their headers checked."""
         count = self.record["block_count"]
         headers = self.section(layout.BLOCK_HEADERS, layout.BLOCK_HEADER.size * count)
-        most = layout.MOST_BLOCK_BYTES * count + layout.LEAST_BLOCK_DATA if count else 0
-        words = self.section(layout.BLOCK_DATA, layout.LEAST_BLOCK_DATA if count else 0, most)
+        most = layout.MOST_BLOCK_BYTES * count + layout.MOST_BEHIND_BLOCKS if count else 0
+        words = self.section(layout.BLOCK_DATA, layout.ALIGNMENT if count else 0, most)
         if len(words) % 4:
             raise unreadable("RDM606", f"{self.where}: BLKD")
         blocks = Blocks(_array(headers, "<u4", np.uint32).reshape(-1, 8), _array(words, "<u4", np.uint32))
@@ -399,6 +401,9 @@ def _check_entry(entry: _Entry) -> None:
 
 
 _TOO_LONG = {layout.METADATA.kind: "RDM902", layout.MATERIALS.kind: "RDM532"}
+_BOUNDS = slice(40, 70)
+"""Low, high and cell in the scene record: all bits are zero where there is no triangle."""
+
 _KNOWN = {section.kind: section for section in layout.SECTIONS}
 
 
@@ -412,11 +417,7 @@ def _check_record(record: dict[str, Any], place: str) -> None:
     check.check_origin(
         [record[f"origin_{axis}"] for axis in "xyz"], bool(record["flags"] & layout.HAS_ORIGIN), place
     )
-    if n == 0 and (
-        stored
-        or record["flags"] & layout.HAS_ORIGIN
-        or any(record[f"{key}_{axis}"] for key in ("low", "high", "cell") for axis in "xyz")
-    ):
+    if n == 0 and record["flags"] & (layout.BOXES_STORED | layout.HAS_ORIGIN):
         raise unreadable("RDM208", place)
     nodes = m >= top + b if stored else m == top
     counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b

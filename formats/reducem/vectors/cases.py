@@ -930,7 +930,7 @@ def _values() -> dict[str, tuple[str, list[str], bytes]]:
         "values_rows_many": spoiled("more rows than entries", "RDM523", rows=2**32 - 1),
         "values_beyond": of(
             "an index without a row",
-            "RDM524 RDM525",
+            "RDM524",
             COLOURS._replace(index=[0, 1, 2, 3])._replace(rows=COLOURS.rows, record={"width": 2}),
         ),
         "values_order": of("rows out of order", "RDM525", COLOURS._replace(index=[0, 2, 1, 1])),
