@@ -144,7 +144,7 @@ def convert_with_report(
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
-        mesh = _geometry(mesh) if options.geometry_only else mesh
+        mesh = mesh.geometry() if options.geometry_only else mesh
         metadata = _metadata(source, mesh)
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)
@@ -237,13 +237,6 @@ def _quantised(
     given = (moved.cleaned.mesh, moved.cleaned.source_face, moved.error_bound, moved.cleaned.origin)
     largest = check_bound(mesh, *given)
     return moved.cleaned, moved.grid_exponent, moved.error_bound, largest
-
-
-def _geometry(mesh: Mesh) -> Mesh:
-    """The mesh without attributes, and a word about what was left out."""
-    words = [{"group": "groups and materials"}.get(one.name, f"{one.name}s") for one in mesh.attributes]
-    notes = (*mesh.notes, f"left out: {', '.join(words)}") if words else mesh.notes
-    return replace(mesh, notes=notes, attributes=(), materials=())
 
 
 def _metadata(source: Mesh | str | Path | IO[bytes], mesh: Mesh) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -68,6 +68,13 @@ class Mesh:
     def attribute(self, name: str) -> Attribute | None:
         """The attribute of a name, or None."""
         return next((one for one in self.attributes if one.name == name), None)
+
+    def geometry(self) -> Mesh:
+        """The mesh without attributes and materials, and a note on what was left out."""
+        if not self.attributes:
+            return replace(self, materials=())
+        note = f"left out: {', '.join(one.plural for one in self.attributes)}"
+        return replace(self, notes=(*self.notes, note), attributes=(), materials=())
 
     @property
     def triangle_count(self) -> int:

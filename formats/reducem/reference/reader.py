@@ -579,7 +579,7 @@ def read_attribute(scene, payload, at, name, domain, components, kind, width, ro
 
 
 def check_rows(scene, name, table, index):
-    """Refuse rows that are not used in the order of their numbers, or are there twice, or name no material."""
+    """Refuse rows that are not used in the order of their numbers, are there twice, or name no material."""
     largest = -1
     for i in index:
         if i > largest + 1:
