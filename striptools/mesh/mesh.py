@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from striptools.errors import LimitError, UsageError
-from striptools.mesh.attributes import Attribute, Material, check_attributes
+from striptools.mesh.attributes import NAMES, Attribute, Material, check_attributes
 from striptools.types import Faces, SourcePositions
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ class Mesh:
             NaN and infinities too (`striptools.mesh.clean` drops what cannot be used).
         faces: `(f, 3)` int32, each row three vertex indices in winding order.
         notes: What loading did to arrive here, one short phrase each ("12 n-gons triangulated").
-        attributes: What else the source says of vertices, corners and faces, at most one of a name.
+        attributes: What else the source says of vertices, corners and faces, at most one of a name; kept in
+            the order of `NAMES`.
         materials: What the numbers of the attribute `group` stand for.
         unit: The length that 1 stands for ("m", "mm", "in"), where the source says so.
 
@@ -61,7 +62,8 @@ class Mesh:
         object.__setattr__(self, "positions", np.ascontiguousarray(positions))
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, np.int32))
         object.__setattr__(self, "notes", tuple(self.notes))
-        object.__setattr__(self, "attributes", tuple(self.attributes))
+        attributes = sorted(self.attributes, key=lambda one: NAMES.index(one.name))
+        object.__setattr__(self, "attributes", tuple(attributes))
         object.__setattr__(self, "materials", tuple(self.materials))
         check_attributes(self.attributes, self.materials, len(positions), len(faces))
 
