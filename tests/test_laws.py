@@ -4,10 +4,10 @@ import time
 import tracemalloc
 
 import pytest
-from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from hypothesis import given
 from hypothesis import strategies as st
 
+from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene
 from striptools.reducem.validate import validate

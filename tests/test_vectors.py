@@ -4,8 +4,8 @@ import hashlib
 import json
 
 import pytest
-from formats import VECTORS, agree, cases, errors_of, make, reference
 
+from formats import VECTORS, agree, cases, errors_of, make, reference
 from striptools.reducem.validate import validate
 
 FILES = cases.all_files()

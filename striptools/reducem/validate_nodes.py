@@ -53,7 +53,7 @@ class _Nodes:
 
 
 def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
-    """Look at the runs, where boxes are stored, and at the nodes; without sound blocks, at what nodes name."""
+    """Look at runs, where boxes are stored, and at nodes; without sound blocks, at what nodes name."""
     record = inspection.sections["SCEN"].data
     blocks, count, top, run_count = (int(x) for x in np.frombuffer(record, "<u4", 4, 4))
     stored = record[24] & 1

@@ -2,10 +2,10 @@
 
 Needs the package atheris beside those of the extra dev; from the root of the repository:
 
-    python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other flags of libFuzzer]
+    python tests/fuzz/fuzz_reader.py [--keep FOLDER] [CORPUS] [-max_total_time=1800 and other libFuzzer flags]
 
-The conformance vectors are the corpus to start with. Most inputs get their lengths, places and checksums mended,
-so that mutations get behind them. With `--keep` a finding is written to the folder, once for each place where
+The conformance vectors are the corpus to start with. Most inputs get lengths, places and checksums mended, so
+that mutations get behind them. With `--keep` a finding is written to the folder, once for each place where
 it comes up, and the run goes on.
 """
 
