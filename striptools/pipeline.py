@@ -20,6 +20,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
+from striptools.reducem.attributes import fitting
 from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise, recentred_bound
 from striptools.reducem.reader import open_scene
 from striptools.reducem.scene import BoxesKind, Scene, bounds_of, scene_from_strips
@@ -144,7 +145,7 @@ def convert_with_report(
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
-        mesh = mesh.geometry() if options.geometry_only else mesh
+        mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
         metadata = _metadata(source, mesh)
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)

@@ -415,12 +415,21 @@ def test_malformed_materials_are_refused(text):
 def test_materials_beyond_the_limit_are_refused():
     scene = coloured(names=("group",))
     with pytest.raises(UnreadableSceneError, match="RDM532"):
-        read_scene(put(scene, b"MATL", b" " * (2**24 + 1)))
+        read_scene(put(scene, b"MATL", b" " * (2**22 + 1)))
     with pytest.raises(LimitError, match="are too many"):
-        encode_materials((Material("x" * 400),) * 50_000)
+        encode_materials((Material("x" * 100),) * 50_000)
     assert json.loads(encode_materials(MATERIALS))[0] == {
         "name": "red", "base_color": [1.0, 0.0, 0.0, 1.0], "group": "body",
     }  # fmt: skip
+
+
+def test_more_groups_than_a_scene_holds_are_left_out_with_a_word():
+    positions, faces = cube()
+    groups = Attribute("group", "face", np.arange(12, dtype=np.int32)[:, None])
+    materials = tuple(Material(f"{k}" * 100) for k in range(12)) + (Material("x" * 110),) * 40_000
+    scene, report = convert_with_report(Mesh(positions, faces, (), (groups,), materials))
+    assert scene.attributes == ()
+    assert report.notes == ("groups left out: 40012 materials are too many",)
 
 
 def test_a_broken_attribute_leaves_the_geometry_readable():

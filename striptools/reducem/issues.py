@@ -97,7 +97,7 @@ _ALL = (
     _flaw("RDM527", "4.7", "an unused bit of the attributes is set"),
     _flaw("RDM528", "4.7", "a group has no material"),
     _flaw("RDM531", "4.8", "the materials are no JSON array of materials in UTF-8"),
-    _flaw("RDM532", "4.8", "the materials are longer than 2^24 bytes"),
+    _flaw("RDM532", "4.8", "the materials are longer than 2^22 bytes"),
     _flaw("RDM601", "4.2", "a block does not begin at the triangle where the one before it ends"),
     _flaw("RDM602", "4.2", "the data of a block do not begin where those before them end"),
     _flaw("RDM603", "4.2", "a block has fewer than 3 vertices, or more strips than triangles"),

@@ -46,7 +46,7 @@ ZERO_WORDS = 16
 GRID_EXPONENTS = range(-149, 105)
 CELL_EXPONENTS = range(-149, 128)
 METADATA_LIMIT = 2**20
-MATERIALS_LIMIT = 2**24
+MATERIALS_LIMIT = 2**22
 ATTRIBUTES_HEAD = 8
 """Bytes before the records of the attributes: how many there are, and a reserved word."""
 

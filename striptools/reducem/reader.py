@@ -444,11 +444,10 @@ def _array(payload: np.ndarray, stored: str, native: type) -> np.ndarray:
 
 def _levels(text: str) -> int:
     """How deep arrays and objects are nested; brackets in strings do not count."""
-    depth = deepest = 0
-    for token in re.finditer(r'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', text, re.DOTALL):
-        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token[0], 0)
-        deepest = max(deepest, depth)
-    return deepest
+    bare = np.frombuffer(re.sub(r'"(?:[^"\\]|\\.)*"?', "", text, flags=re.DOTALL).encode(), np.uint8)
+    opening = (bare == ord("[")) | (bare == ord("{"))
+    closing = (bare == ord("]")) | (bare == ord("}"))
+    return int(np.cumsum(opening.astype(np.int32) - closing).max(initial=0))
 
 
 def _integer(digits: str) -> int | str:

@@ -593,8 +593,8 @@ def check_rows(scene, name, table, index):
 
 def read_materials(payload):
     """The array of MATL."""
-    if len(payload) > 2**24:
-        raise RefusedError("4.8", "more than 2^24 bytes")
+    if len(payload) > 2**22:
+        raise RefusedError("4.8", "more than 2^22 bytes")
     materials = read_json("4.8", payload)
     if not isinstance(materials, list) or not 1 <= len(materials) <= 65536:
         raise RefusedError("4.8", "no array of 1 to 65,536 materials")

@@ -979,10 +979,10 @@ def _materials() -> dict[str, tuple[str, list[str], bytes]]:
     many = Plan(PAIR.blocks, attributes=[GROUPS], materials=[RED, GLASS])
     return made | {
         "materials_long": wrong(
-            "materials of 2^24 + 1 bytes",
+            "materials of 2^22 + 1 bytes",
             "RDM532",
             many,
-            payloads={"MATL": lambda _: bytes(2**24 + 1)},
+            payloads={"MATL": lambda _: bytes(2**22 + 1)},
             packed={"MATL": lambda data: frame(data[:100], kind=1)},
         ),
         "materials_alone": wrong("materials and no groups", "RDM117", PAIR, materials=[RED]),
