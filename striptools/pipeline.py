@@ -20,7 +20,8 @@ from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
-from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise
+from striptools.reducem.attributes import fitting
+from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise, recentred_bound
 from striptools.reducem.reader import open_scene
 from striptools.reducem.scene import BoxesKind, Scene, bounds_of, scene_from_strips
 from striptools.stopwatch import Stopwatch, Watch
@@ -45,6 +46,7 @@ class Options:
         ordering: Strips: method, cap, effort, blocks.
         boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
+        geometry_only: Leave out normals, texture coordinates, colours, groups and materials.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:
@@ -57,6 +59,7 @@ class Options:
     ordering: OrderingOptions = field(default_factory=OrderingOptions)
     boxes: BoxesKind = "rebuilt"
     remap: bool = True
+    geometry_only: bool = False
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -78,7 +81,8 @@ class Report:
         weld_error: The largest distance by which welding moved a vertex, in the model's unit.
         grid_exponent: Positions were moved to multiples of 2 to this power; None where every bit is kept.
         largest_error: The largest distance of a vertex from the loaded one where there is a grid, else None.
-        notes: What loading had to say.
+        notes: What loading had to say, and what was left out.
+        origin: The origin that float64 positions were given, (3,) float64, or None.
     """
 
     seconds: dict[str, float]
@@ -89,6 +93,7 @@ class Report:
     grid_exponent: int | None
     largest_error: float | None
     notes: tuple[str, ...]
+    origin: np.ndarray | None = None
 
 
 def convert(
@@ -140,7 +145,8 @@ def convert_with_report(
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
-        metadata = _metadata(source)
+        mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
+        metadata = _metadata(source, mesh)
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)
         _refuse_nothing(cleaned)
@@ -177,14 +183,15 @@ def convert_with_report(
             grid_exponent=exponent,
             error_bound=bound,
             metadata=metadata,
+            origin=cleaned.origin,
             threads=threads,
-        )
+        ).with_attributes(cleaned.mesh, strips)
         if options.boxes == "stored":
             scene = scene.storing_boxes(threads)
     counts = cleaned.counts | {"strips": scene.strip_count, "blocks": scene.block_count}
     seconds, peak = clock.read()
     moved = (cleaned.largest_rounding, cleaned.weld_error, exponent, largest_error)
-    return scene, Report(seconds, peak, counts, *moved, notes)
+    return scene, Report(seconds, peak, counts, *moved, notes, cleaned.origin)
 
 
 def open(source: str | Path | IO[bytes]) -> Scene:
@@ -223,22 +230,20 @@ def _quantised(
 ) -> tuple[Cleaned, int | None, float, float | None]:
     """The mesh on its grid where one is asked for, the grid's exponent, the bound and the largest error."""
     if options.precision.is_lossless:
-        return cleaned, None, cleaned.weld_error, None
+        bound = cleaned.weld_error if cleaned.origin is None else recentred_bound(cleaned)
+        return cleaned, None, bound, None
     drop = options.clean.drop_duplicates
     moved = quantise(cleaned, options.precision, drop_duplicates=drop, threads=threads)
     _refuse_nothing(moved.cleaned, "quantised_")
-    largest = check_bound(mesh, moved.cleaned.mesh, moved.cleaned.source_face, moved.error_bound)
+    given = (moved.cleaned.mesh, moved.cleaned.source_face, moved.error_bound, moved.cleaned.origin)
+    largest = check_bound(mesh, *given)
     return moved.cleaned, moved.grid_exponent, moved.error_bound, largest
 
 
-def _metadata(source: Mesh | str | Path | IO[bytes]) -> dict[str, Any]:
+def _metadata(source: Mesh | str | Path | IO[bytes], mesh: Mesh) -> dict[str, Any]:
     metadata = {"generator": f"striptools {__version__}"}
     if isinstance(source, str | Path):
         metadata["source"] = Path(source).name
-        if Path(source).suffix.lower() in _METRES:
-            metadata["unit"] = "m"
+    if mesh.unit:
+        metadata["unit"] = mesh.unit
     return metadata
-
-
-_METRES = (".glb", ".gltf")
-"""Formats whose unit is the metre by their specification."""

@@ -112,6 +112,24 @@ def assert_same(scene, decoded) -> None:
         pairs = list(zip(scene.remap.face.tolist(), scene.remap.rotation.tolist(), strict=True))
         assert pairs == decoded.remap
     assert set(scene.metadata) == set(decoded.metadata)
+    origin = np.array([decoded.record[f"origin_{axis}"] for axis in "xyz"])
+    np.testing.assert_array_equal(scene.origin if scene.origin is not None else np.zeros(3), origin)
+    assert_same_values(scene, decoded)
+
+
+NAMES = {"normal": "NORM", "texcoord": "TEXC", "color": "COLR", "group": "GRUP"}
+
+
+def assert_same_values(scene, decoded) -> None:
+    """Assert that both readers made the same of attributes and materials, bit for bit."""
+    assert {NAMES[one.name] for one in scene.attributes} == set(decoded.attributes)
+    for one in scene.attributes:
+        domain, values = decoded.attributes[NAMES[one.name]]
+        assert one.domain == ("vertex", "corner", "face")[domain]
+        bits = one.values.view(np.uint32) if one.values.dtype == np.float32 else one.values
+        np.testing.assert_array_equal(bits, values)
+    materials = [(one.name, list(one.base_color), one.group) for one in scene.materials]
+    assert materials == [(m["name"], m["base_color"], m.get("group", "")) for m in decoded.materials]
 
 
 # Files that no encoder chose

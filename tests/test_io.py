@@ -277,7 +277,11 @@ def test_off_polygons_stay_in_file_order():
     )
     mesh = read(text + "4 0 1 2 3 255 0 0\n3 0 1 2\n2 0 1\n5 0 1 2 3 4\n", "off")
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
-    assert mesh.notes == ("2 n-gons cut into 5 triangles", "1 face of fewer than 3 corners left out")
+    assert mesh.notes == (
+        "2 n-gons cut into 5 triangles",
+        "1 face of fewer than 3 corners left out",
+        "the colours of 1 face left out",
+    )
     np.testing.assert_array_equal(mesh.positions, POINTS)
 
 

@@ -11,8 +11,8 @@ from typing import IO, Annotated, cast
 import typer
 
 from striptools.errors import UnreadableMeshError, UsageError
-from striptools.mesh.clean import CleanOptions, clean
-from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh
+from striptools.mesh.clean import RECENTRINGS, CleanOptions, Recentring, clean
+from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh, unkept
 from striptools.mesh.mesh import Mesh
 from striptools.partition.sah import SMALLEST_BLOCK
 from striptools.pipeline import Options, Report, convert_with_report
@@ -55,6 +55,7 @@ _SAID_OF_COUNTS = {
     "duplicate_faces_kept": "kept {} (--drop-duplicates drops them)|duplicate face|duplicate faces",
     "vertices_welded": "welded {}|vertex|vertices",
     "vertices_unreferenced": "left out {} that no face uses|vertex|vertices",
+    "vertices_with_seams": "kept several values at {}|vertex|vertices",
 }
 
 _SAID_OF_GRIDS = {
@@ -80,6 +81,20 @@ def run(
         float,
         typer.Option(min=0.0, metavar="DIST", help="Merge vertices up to this far apart; 0: equal ones."),
     ] = _CLEAN.weld,
+    geometry_only: Annotated[
+        bool,
+        typer.Option(
+            "--geometry-only", help="Leave out normals, texture coordinates, colours, groups, materials."
+        ),
+    ] = _OPTIONS.geometry_only,
+    recentre: Annotated[
+        str,
+        typer.Option(
+            metavar="WHEN",
+            help="Give float64 positions an origin of their own where float32 keeps them far better by it: "
+            f"{', '.join(RECENTRINGS)}.",
+        ),
+    ] = _CLEAN.recentre,
     drop_duplicates: Annotated[
         bool, typer.Option("--drop-duplicates", help="Keep one of several faces with the same corners.")
     ] = _CLEAN.drop_duplicates,
@@ -171,7 +186,8 @@ def run(
     """
     log.set_up(quiet=quiet, verbose=verbose)
     options = Options(
-        clean=CleanOptions(weld=weld, drop_duplicates=drop_duplicates),
+        clean=CleanOptions(weld, drop_duplicates, cast(Recentring, recentre)),
+        geometry_only=geometry_only,
         ordering=OrderingOptions(
             max_length,
             cast(Method, stripifier),
@@ -287,6 +303,7 @@ def _to_scene(
         "weld_error": report.weld_error,
         "error_bound": scene.error_bound,
         "largest_error": report.largest_error,
+        "origin": None if report.origin is None else report.origin.tolist(),
         "notes": list(report.notes),
     }
     return _Outcome(lines, list(_details(seconds, scene)), facts)
@@ -307,8 +324,10 @@ def _to_mesh(
     order = "in the source's order" if scene.remap else "in file order, for the scene has no remap"
     line = f"{_arrow(source, target)}, {mesh.triangle_count:,} triangles {order}"
     counts = {"triangles": mesh.triangle_count, "vertices": mesh.vertex_count, "strips": scene.strip_count}
-    facts = {"seconds": seconds, "peak_bytes": peak, "counts": counts}
-    return _Outcome([line], list(_details(seconds, scene)), facts)
+    left_out = unkept(mesh, formats[1])
+    facts = {"seconds": seconds, "peak_bytes": peak, "counts": counts, "left_out": list(left_out)}
+    lines = [line, *([f"  left out: {', '.join(left_out)}"] if left_out else [])]
+    return _Outcome(lines, list(_details(seconds, scene)), facts)
 
 
 def _to_strips(
@@ -353,9 +372,11 @@ def _loaded_clean(
 ) -> tuple[Mesh, list[str], dict[str, int]]:
     """A mesh fit for strips, what loading and cleaning have to say, and cleaning's counts."""
     if read_format == SCENE_FORMAT:
-        return read_scene(source.file).to_mesh(), [], {}
-    mesh = load_mesh(source.file, file_format=read_format or None)
-    cleaned = clean(mesh, options.clean)
+        mesh = read_scene(source.file).to_mesh().geometry()
+        return mesh, [f"  {note}" for note in mesh.notes], {}
+    mesh = load_mesh(source.file, file_format=read_format or None).geometry()
+    # A mesh has no place for an origin.
+    cleaned = clean(mesh, dataclasses.replace(options.clean, recentre="never"), options.threads or 1)
     if cleaned.mesh.triangle_count == 0:
         raise UnreadableMeshError("no face is left after cleaning", where=source.title)
     report = Report(
@@ -380,6 +401,9 @@ def _changes(report: Report) -> Iterator[str]:
     for note in report.notes:
         yield f"  loaded: {note}"
     yield from _said(report, "cleaned", _SAID_OF_COUNTS)
+    if report.origin is not None:
+        origin = ", ".join(f"{value:.12g}" for value in report.origin.tolist())
+        yield f"  cleaned: moved to an origin at ({origin}), in whose frame rays are traced"
     if report.largest_rounding > 0.0:
         yield f"  cleaned: rounded to float32, by at most {human_value(report.largest_rounding)}"
     if report.weld_error > 0.0:

@@ -22,8 +22,8 @@ def run(
     `vertices` counts those of all blocks, so that one that several blocks share counts for each of them
     (`vertex_duplication`: how often on the average), `vertices_per_triangle` the entries of the strips: n + 2
     for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
-    what tracing needs, so every part but the remap, before compression; `resident_bytes_per_triangle` what a
-    tracer holds that traces the blocks as they are, boxes and all.
+    what tracing needs, so every part but the remap and attributes, before compression;
+    `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all.
     """
     log.set_up()
     file = Source.open(source)
@@ -51,6 +51,7 @@ def describe(scene: Scene) -> dict[str, object]:
         "resident_bytes_per_triangle": scene.resident_bytes_per_triangle(),
         "bytes": {**parts, "total": sum(parts.values())},
         "bytes_per_triangle_by_part": {part: _share(size, triangles) for part, size in parts.items()},
+        **_carried(scene),
         "precision": _precision(scene),
         "axes": _axes(scene),
         "format_version": f"{VERSION[0]}.{VERSION[1]}",
@@ -61,10 +62,27 @@ def describe(scene: Scene) -> dict[str, object]:
     }
 
 
+def _carried(scene: Scene) -> dict[str, object]:
+    """What a scene has beside geometry, each only where it is there."""
+    sizes = scene.attribute_bytes()
+    found: dict[str, object] = {}
+    if scene.columns:
+        found["attributes"] = {
+            one.name: {"of": one.domain, "distinct": len(one.rows), "bytes": sizes[one.name]}
+            for one in scene.columns
+        }
+    if scene.materials:
+        found["materials"] = len(scene.materials)
+    if scene.origin is not None:
+        found["origin"] = scene.origin.tolist()
+    return found
+
+
 def _precision(scene: Scene) -> dict[str, object]:
     exponent = scene.grid_exponent
     if exponent is None:
-        kind = "lossless" if scene.error_bound == 0.0 else "welded"
+        kind = "welded" if scene.error_bound else "lossless"
+        kind = kind if scene.origin is None else "recentred"
         return {"kind": kind, "bits": 32, "error_bound": scene.error_bound}
     longest = float((scene.high.astype(np.float64) - scene.low).max(initial=0.0))
     cells = round(longest / 2.0**exponent)

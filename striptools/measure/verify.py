@@ -6,7 +6,7 @@ check: `structure`. Cost: rays x faces pairs for the rays that every face is tri
 100,000 faces), microseconds for each further aimed ray.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -199,6 +199,9 @@ def verify(
             f"the source has {source.triangle_count} faces, the scene's had {scene.source_face_count}",
             remedy="give the file that was converted",
         )
+    if scene.origin is not None:
+        # Rays and answers are in the frame about the origin; so is the source from here on.
+        source = replace(source, positions=source.positions - scene.origin)
     tell = watch or (lambda stage, fraction: None)
     tell("structure", 0.0)
     structure = compare_structure(scene, source)

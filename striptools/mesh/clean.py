@@ -3,7 +3,9 @@
 The order of the work, which decides what a face is counted under:
 
 1. Positions are rounded to float32 (to nearest); the largest rounding is reported. A value beyond float32's
-   range becomes infinite.
+   range becomes infinite. float64 positions far from zero, as surveys and CAD have them, are first moved to
+   an origin of their own (recentre.py), where that leaves them much closer to what they were; float32
+   positions never are.
 2. Vertices are welded. By default those whose three words are equal BIT FOR BIT: so -0.0 and +0.0 stay apart,
    because positions have to come back bit-exact, and a seam of mixed zeros stays a seam. With a tolerance
    each vertex, by ascending index, moves to the nearest vertex before it that was not itself moved and lies
@@ -16,6 +18,8 @@ The order of the work, which decides what a face is counted under:
    winding.
 4. Vertices that no kept face uses are dropped. What is left keeps its order, faces and vertices alike, and
    each face its first corner.
+5. Attributes follow their corners: a welded vertex may carry several normals, which then stand at the corners
+   (attributes.py).
 
 Zero area is decided exactly: float64 with an error bound first (kernels/degenerate.py); then, for the
 doubtful faces, float64 once more where every difference and product is exact in it; then integers.
@@ -25,16 +29,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from striptools.errors import UsageError
+from striptools.mesh.attributes import follow
 from striptools.mesh.mesh import Mesh
+from striptools.mesh.recentre import Origin, recentred
 from striptools.threads import in_chunks, in_parts
 from striptools.types import FaceIds, Faces, Positions, SourcePositions
 
 CHUNK = 1 << 16
 """Rows handled at a time where temporary arrays would otherwise be as large as the mesh."""
+
+
+Recentring = Literal["auto", "never"]
+RECENTRINGS: tuple[Recentring, ...] = get_args(Recentring)
 
 
 @dataclass(frozen=True)
@@ -46,19 +57,24 @@ class CleanOptions:
             vertices that are equal bit for bit.
         drop_duplicates: Whether a face with the same vertices in the same winding as an earlier one is
             dropped.
+        recentre: Whether float64 positions may get an origin of their own: `auto`, where rounding to float32
+            loses so much less after it (recentre.py), or `never`.
 
     Raises:
-        UsageError: Where `weld` is negative or not finite.
+        UsageError: Where `weld` is negative or not finite, or `recentre` is neither word.
     """
 
     weld: float = 0.0
     drop_duplicates: bool = False
+    recentre: Recentring = "auto"
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.weld) and self.weld >= 0):
             raise UsageError(
                 f"a weld distance of {self.weld}", remedy="a finite distance of 0 or more is wanted"
             )
+        if self.recentre not in RECENTRINGS:
+            raise UsageError(f"recentre {self.recentre!r}", remedy=f"one of {', '.join(RECENTRINGS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +88,14 @@ class Cleaned:
         counts: `faces_in == faces_out + non_finite + repeated_vertex + zero_area + duplicate_faces_dropped`
             and `vertices_in == vertices_out + vertices_welded + vertices_unreferenced`;
             `duplicate_faces_kept` are the faces among `faces_out` that repeat an earlier one in vertices and
-            winding.
-        largest_rounding: The largest change of a coordinate by rounding to float32, in the model's unit;
-            values that overflow are counted as non-finite instead.
+            winding; where there are attributes, `vertices_with_seams` are the vertices whose corners
+            differ in one of them.
+        largest_rounding: The largest change of a coordinate by moving it to the origin and rounding to
+            float32, in the model's unit; values that overflow are counted as non-finite instead.
         weld_error: The farthest a vertex was moved by welding, in the model's unit: at most
             `CleanOptions.weld`.
+        origin: `(3,)` float64: what to add to the positions, to be where the source is; None where they stand
+            as they are.
     """
 
     mesh: Mesh
@@ -84,6 +103,7 @@ class Cleaned:
     counts: dict[str, int]
     largest_rounding: float
     weld_error: float
+    origin: Origin | None = None
 
 
 DEFAULT_OPTIONS = CleanOptions()
@@ -101,6 +121,9 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS, threads: int = 1)
     from striptools.kernels.degenerate import USABLE
 
     positions, largest_rounding = round_positions(mesh.positions)
+    origin = None
+    if largest_rounding > 0 and options.recentre == "auto":
+        positions, largest_rounding, origin = recentred(mesh.positions, positions, largest_rounding)
     leader, weld_error = weld_vertices(positions, options.weld, threads)
     welded = _followers(leader)
     faces = leader[mesh.faces] if welded else mesh.faces
@@ -126,8 +149,14 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS, threads: int = 1)
         "vertices_welded": welded,
         "vertices_unreferenced": len(positions) - welded - vertices_out,
     }
-    cleaned = Mesh(positions if vertices_out == len(positions) else positions[used], kept_faces, mesh.notes)
-    return Cleaned(cleaned, source_face, counts, largest_rounding, weld_error)
+    attributes = ()
+    if mesh.attributes:
+        attributes, counts["vertices_with_seams"] = follow(
+            mesh.attributes, mesh.faces, source_face, kept_faces, np.flatnonzero(used)
+        )
+    positions = positions if vertices_out == len(positions) else positions[used]
+    cleaned = Mesh(positions, kept_faces, mesh.notes, attributes, mesh.materials, mesh.unit)
+    return Cleaned(cleaned, source_face, counts, largest_rounding, weld_error, origin)
 
 
 def round_positions(positions: SourcePositions) -> tuple[Positions, float]:

@@ -6,8 +6,8 @@ the file is there, in the file's order and winding, positions bit for bit; faces
 or left out, and a note says how many. Every header is checked against the bytes that are there before
 anything is allocated.
 
-Writing goes through trimesh too, but for OBJ, of which it writes 8 decimal places where float32 needs 9
-digits.
+Writing plain geometry goes through trimesh too, but for OBJ, of which it writes 8 decimal places where
+float32 needs 9 digits. What carries more is written by `striptools.mesh.writers`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 
 from striptools.errors import StriptoolsError, UnreadableMeshError, UsageError
 from striptools.mesh.atomic import write_atomically, write_stream
+from striptools.mesh.attributes import Attribute
 from striptools.mesh.mesh import MOST_FACES, Mesh, first_face_out_of_range
 from striptools.mesh.readers.meshlab import FORMATS as MESHLAB_FORMATS
 from striptools.mesh.readers.parsed import EXPORT_AGAIN, Parsed, counted
@@ -76,8 +77,10 @@ def load_mesh(source: str | Path | IO[bytes], *, file_format: str | None = None)
 def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | None = None) -> int:
     """Write a mesh file, whole or not at all: PLY (binary, little endian), OBJ, STL (binary) or GLB.
 
-    Positions are written as float32, bit for bit where they are float32; OBJ holds the digits that bring back
-    the same float32 or float64. STL has no shared vertices.
+    Positions are written as float32, bit for bit where they are float32; PLY and OBJ hold float64 too where
+    they are that. STL has no shared vertices. Attributes are written where the format can hold them, vertices
+    split where it must be: `unkept` says what it cannot. An OBJ file with materials gets a file of its name
+    and .mtl beside it, where `target` is a path.
 
     Args:
         mesh: What to write.
@@ -97,8 +100,50 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
         raise UsageError(
             f"no mesh format to write: {name or 'none given'}", remedy=f"one of {', '.join(WRITE_FORMATS)}"
         )
-    data = _encode_obj(mesh) if name == "obj" else _encode_through_trimesh(mesh, name)
+    library = _write_library(mesh, Path(target)) if is_path and name == "obj" else ""  # pyright: ignore[reportArgumentType]
+    data = _encode(mesh, name, library)
     return write_atomically(target, data) if is_path else write_stream(target, data)
+
+
+def unkept(mesh: Mesh, file_format: str) -> tuple[str, ...]:
+    """What `save_mesh` leaves out of a file of a format, in words for people; empty where it is nothing."""
+    words = [one.plural for one in mesh.attributes if not _is_kept(one, file_format)]
+    if file_format == "glb" and any(one.group for one in mesh.materials):
+        words.append("names of groups")
+    if file_format in ("stl", "glb") and (mesh.positions.astype(np.float32) != mesh.positions).any():
+        words.append("what float32 cannot hold of the positions")
+    return tuple(words)
+
+
+def _is_kept(one: Attribute, file_format: str) -> bool:
+    if file_format == "obj":
+        return one.name != "color" or (one.domain == "vertex" and one.values.shape[1] == 3)
+    return file_format == "glb" or (file_format == "ply" and one.name != "group")
+
+
+def _write_library(mesh: Mesh, target: Path) -> str:
+    """Write the material file of an OBJ file, where it has materials; its name."""
+    from striptools.mesh.writers.obj import encode_library
+
+    if mesh.attribute("group") is None or not any(one.name for one in mesh.materials):
+        return ""
+    beside = target.with_suffix(".mtl")
+    write_atomically(beside, encode_library(mesh.materials))
+    return beside.name
+
+
+def _encode(mesh: Mesh, name: str, library: str) -> bytes:
+    from striptools.mesh.writers.glb import encode_glb
+    from striptools.mesh.writers.obj import encode_obj
+    from striptools.mesh.writers.ply import encode_ply
+
+    if name == "obj":
+        return encode_obj(mesh, library)
+    if name == "ply" and (mesh.attributes or mesh.positions.dtype == np.float64):
+        return encode_ply(mesh)
+    if name == "glb" and mesh.attributes:
+        return encode_glb(mesh)
+    return _encode_through_trimesh(mesh, name)
 
 
 def _load_stream(stream: IO[bytes], where: str, file_format: str | None) -> Mesh:
@@ -136,7 +181,7 @@ def _read(file: IO[bytes], path: Path, folder: Path | None, name: str) -> Parsed
 
     readers: dict[str, Callable[[], Parsed]] = {
         "ply": lambda: ply.read_ply(file),
-        "obj": lambda: obj.read_obj(file),
+        "obj": lambda: obj.read_obj(file, folder),
         "stl": lambda: stl.read_stl(file),
         "off": lambda: off.read_off(file),
         "glb": lambda: gltf.read_glb(file, folder),
@@ -165,7 +210,14 @@ def _finish(parsed: Parsed) -> Mesh:
         raise UnreadableMeshError(
             f"{len(parsed.faces)} triangles", remedy=f"at most {MOST_FACES} are handled"
         )
-    return Mesh(_native(parsed.positions), parsed.faces.astype(np.int32), parsed.notes)
+    return Mesh(
+        _native(parsed.positions),
+        parsed.faces.astype(np.int32),
+        parsed.notes,
+        parsed.attributes,
+        parsed.materials,
+        parsed.unit,
+    )
 
 
 def _native(positions: np.ndarray) -> np.ndarray:
@@ -183,13 +235,3 @@ def _encode_through_trimesh(mesh: Mesh, name: str) -> bytes:
         data = trimesh.Trimesh(positions, mesh.faces, process=False).export(file_type=name)
     assert isinstance(data, bytes)
     return data
-
-
-def _encode_obj(mesh: Mesh) -> bytes:
-    digits = 9 if mesh.positions.dtype == np.float32 else 17
-    line = f"v %.{digits}g %.{digits}g %.{digits}g\n"
-    vertices = (line * mesh.vertex_count) % tuple(mesh.positions.reshape(-1).tolist())
-    faces = ("f %d %d %d\n" * mesh.triangle_count) % tuple(
-        (mesh.faces.reshape(-1).astype(np.int64) + 1).tolist()
-    )
-    return (vertices + faces).encode()

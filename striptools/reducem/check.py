@@ -8,7 +8,9 @@ import numpy as np
 from striptools.errors import LimitError, UnreadableSceneError, UsageError
 from striptools.hierarchies.packed import check_packed
 from striptools.kernels import scene as kernels
+from striptools.mesh.attributes import Domain
 from striptools.reducem import layout
+from striptools.reducem.attributes import check_columns
 from striptools.reducem.blocks import check_headers
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene, bounds_of
@@ -82,6 +84,7 @@ def check_scene(scene: Scene, where: str = "scene") -> None:
     _check_positions(scene, where)
     check_nodes(scene, where)
     check_remap(scene.remap, scene.triangle_count, scene.source_face_count, where)
+    _check_attributes(scene, where)
     check_metadata(scene.metadata, where)
 
 
@@ -96,14 +99,29 @@ def check_record(scene: Scene, where: str) -> None:
         raise unreadable("RDM201", place)
     if not (math.isfinite(scene.error_bound) and scene.error_bound >= 0.0):
         raise unreadable("RDM202", place)
+    if scene.origin is not None:
+        check_origin(scene.origin.tolist(), True, place)
     if exponent is not None and exponent not in layout.GRID_EXPONENTS:
         raise unreadable("RDM203", place)
     if not (np.isfinite(scene.low).all() and np.isfinite(scene.high).all()):
         raise unreadable("RDM205", place)
     if any(int(cell) not in layout.CELL_EXPONENTS for cell in scene.grid.cell):
         raise unreadable("RDM206", place)
-    if scene.block_count == 0 and (scene.low.any() or scene.high.any() or scene.grid.cell.any()):
+    if scene.block_count == 0 and (
+        scene.low.any() or scene.high.any() or scene.grid.cell.any() or scene.origin is not None
+    ):
         raise unreadable("RDM208", place)
+
+
+def check_origin(origin: list[float], there: bool, place: str) -> None:
+    """Make sure that an origin is one, and that there is none where the flag says so.
+
+    Raises:
+        UnreadableSceneError: It is not.
+    """
+    zero = all(value == 0.0 and math.copysign(1.0, value) > 0.0 for value in origin)
+    if not all(map(math.isfinite, origin)) or (not any(origin) if there else not zero):
+        raise unreadable("RDM209", place)
 
 
 def check_nodes(scene: Scene, where: str) -> None:
@@ -168,6 +186,7 @@ def _check_dtypes(scene: Scene) -> None:
         ("packed.runs", scene.packed.runs, np.uint16),
         ("low", scene.low, np.float32),
         ("high", scene.high, np.float32),
+        ("origin", scene.origin, np.float64),
     ]
     if scene.remap is not None:
         wanted += [
@@ -177,6 +196,15 @@ def _check_dtypes(scene: Scene) -> None:
     for name, array, dtype in wanted:
         if array is not None and array.dtype != dtype:
             raise UsageError(f"{name} has dtype {array.dtype}, not {np.dtype(dtype)}", where="scene")
+
+
+def _check_attributes(scene: Scene, where: str) -> None:
+    count = scene.triangle_count
+    if count == 0 and (scene.columns or scene.materials):
+        raise unreadable("RDM117", f"{where}: {'ATTR' if scene.columns else 'MATL'}")
+    if count:
+        entries: dict[Domain, int] = {"vertex": scene.vertex_count, "corner": 3 * count, "face": count}
+        check_columns(scene.columns, entries, scene.materials, where)
 
 
 def _check_positions(scene: Scene, where: str) -> None:

@@ -1,7 +1,7 @@
 """Every flaw of a scene file, by a code that users can cite; formats/reducem/ISSUES.md lists the same.
 
-Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 6 blocks, 7 nodes, 8 runs, 9 metadata.
-Those of 3 and 4 belonged to formats before 0.3 and are not used again.
+Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 52 attributes, 53 materials, 6 blocks,
+7 nodes, 8 runs, 9 metadata. Those of 3 and 4 belonged to formats before 0.3 and are not used again.
 """
 
 import sys
@@ -91,10 +91,21 @@ _ALL = (
     _flaw("RDM206", "4.1", "the exponent of a cell is out of its range"),
     _flaw("RDM207", "4.1", "the longest run is not 1 to 8, or not 0 where boxes are not stored"),
     _flaw("RDM208", "4.1", "a field of an empty scene is not zero"),
+    _flaw("RDM209", "4.1", "the origin is not finite, zero, or there without its flag"),
     _flaw("RDM501", "4.6", "a rotation is not 0, 1 or 2"),
     _flaw("RDM502", "4.6", "a triangle comes from a face that the source does not have"),
     _flaw("RDM503", "4.6", "two triangles come from one source face"),
     _flaw("RDM504", "4.6", "an unused bit of the rotations is set"),
+    _flaw("RDM521", "4.7", "an attribute has a name, domain or type that it cannot have, or is there twice"),
+    _flaw("RDM522", "4.7", "the attributes are longer or shorter than their records say"),
+    _flaw("RDM523", "4.7", "an attribute has no row, too many rows, or another index width than they need"),
+    _flaw("RDM524", "4.7", "an index names no row of its attribute"),
+    _flaw("RDM525", "4.7", "the rows of an attribute are not used, or not in the order of their first use"),
+    _flaw("RDM526", "4.7", "two rows of an attribute are equal"),
+    _flaw("RDM527", "4.7", "an unused bit of the attributes is set"),
+    _flaw("RDM528", "4.7", "a group has no material"),
+    _flaw("RDM531", "4.8", "the materials are no JSON array of materials in UTF-8"),
+    _flaw("RDM532", "4.8", "the materials are longer than 2^22 bytes"),
     _flaw("RDM601", "4.2", "a block does not begin at the triangle where the one before it ends"),
     _flaw("RDM602", "4.2", "the data of a block do not begin where those before them end"),
     _flaw("RDM603", "4.2", "a block has fewer than 3 vertices, or more strips than triangles"),
@@ -121,10 +132,10 @@ _ALL = (
     _flaw("RDM801", "4.5", "the runs of a block do not begin where those before them end"),
     _flaw("RDM802", "4.5", "a run is not in one strip of its block, or longer than the longest run"),
     _flaw("RDM803", "4.5", "a triangle is not in exactly one run"),
-    _flaw("RDM901", "4.7", "the metadata are no JSON object in UTF-8"),
-    _flaw("RDM902", "4.7", "the metadata are longer than 2^20 bytes"),
-    _flaw("RDM903", "4.7", "generator, source or unit is not a string"),
-    _flaw("RDM904", "4.7", "the metadata are nested deeper than 32 levels"),
+    _flaw("RDM901", "4.9", "the metadata are no JSON object in UTF-8"),
+    _flaw("RDM902", "4.9", "the metadata are longer than 2^20 bytes"),
+    _flaw("RDM903", "4.9", "generator, source or unit is not a string"),
+    _flaw("RDM904", "4.9", "the metadata are nested deeper than 32 levels"),
 )
 
 ISSUES = {issue.code: issue for issue in _ALL}

@@ -20,6 +20,7 @@ LARGEST_WINDOW = 27
 
 BOXES_STORED = 1
 ON_GRID = 2
+HAS_ORIGIN = 4
 """Bits of the scene record's flags."""
 
 BLOCK_FLIPS = 1
@@ -45,6 +46,10 @@ ZERO_WORDS = 16
 GRID_EXPONENTS = range(-149, 105)
 CELL_EXPONENTS = range(-149, 128)
 METADATA_LIMIT = 2**20
+MATERIALS_LIMIT = 2**22
+ATTRIBUTES_HEAD = 8
+"""Bytes before the records of the attributes: how many there are, and a reserved word."""
+
 METADATA_NAMES = ("generator", "source", "unit")
 
 
@@ -137,7 +142,9 @@ SCENE_RECORD = _record(
     ("<i2", "cell_y"),
     ("<i2", "cell_z"),
     ("<u2", "longest_run"),
-    ("24u1", "reserved_3"),
+    ("<f8", "origin_x"),
+    ("<f8", "origin_y"),
+    ("<f8", "origin_z"),
 )
 BLOCK_HEADER = _record(
     "block header",
@@ -174,7 +181,17 @@ NODE_RECORD = _record(
     ("8u1", "high_y"),
     ("8u1", "high_z"),
 )
-RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD)
+ATTRIBUTE = _record(
+    "attribute record",
+    ("S4", "name"),
+    ("u1", "domain"),
+    ("u1", "components"),
+    ("u1", "type"),
+    ("u1", "width"),
+    ("<u4", "rows"),
+    ("<u4", "reserved"),
+)
+RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD, ATTRIBUTE)
 
 SCENE = Section(b"SCEN", True)
 BLOCK_HEADERS = Section(b"BLKH", True)
@@ -182,8 +199,10 @@ BLOCK_DATA = Section(b"BLKD", True)
 NODES = Section(b"NODE", True)
 RUNS = Section(b"RUNS", True)
 REMAP = Section(b"RMAP", False)
+ATTRIBUTES = Section(b"ATTR", False)
+MATERIALS = Section(b"MATL", False)
 METADATA = Section(b"META", False)
-SECTIONS = (SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, METADATA)
+SECTIONS = (SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, ATTRIBUTES, MATERIALS, METADATA)
 """In the order in which the writer puts them."""
 
 PARTS = (
@@ -193,6 +212,7 @@ PARTS = (
     "block_headers",
     "top_level",
     "remap",
+    "attributes",
     "container",
 )
 """What the bytes of a file are counted by; container is header, table, scene record, metadata and padding."""
@@ -208,12 +228,17 @@ def remap_length(triangles: int) -> int:
     return 4 * triangles + -(-triangles // 4)
 
 
+def most_attribute_bytes(triangles: int) -> int:
+    """The most bytes of the attributes of so many triangles: four kinds with a row a corner, and more."""
+    return 256 * (triangles + 1)
+
+
 def section_lengths(
     triangles: int, blocks: int, nodes: int, runs: int, *, boxes_stored: bool
 ) -> dict[bytes, int]:
     """Say how long each section of a scene is, decoded, where its counts alone say so; 0 means left out.
 
-    Block data, metadata, and whether there is a remap are not the counts' matter.
+    Block data, attributes, materials, metadata, and whether there is a remap are not the counts' matter.
     """
     return {
         SCENE.kind: SCENE_RECORD.size,

@@ -17,6 +17,7 @@ import numpy as np
 from striptools.errors import StriptoolsError, UsageError
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.mesh import Mesh
+from striptools.mesh.recentre import Origin, displacement
 from striptools.reducem.layout import GRID_EXPONENTS
 from striptools.types import FaceIds, Positions
 
@@ -170,7 +171,7 @@ def quantise(
     mesh = cleaned.mesh
     already = cleaned.weld_error + math.sqrt(3.0) * cleaned.largest_rounding * SLACK
     exponent = _exponent(mesh, precision, already)
-    moved = Mesh(snap(mesh.positions, exponent), mesh.faces, mesh.notes)  # pyright: ignore
+    moved = replace(mesh, positions=snap(mesh.positions, exponent))  # pyright: ignore[reportArgumentType]
     again = clean(moved, CleanOptions(drop_duplicates=drop_duplicates), threads)
     counts = cleaned.counts | {
         "quantised_repeated_vertex": again.counts["repeated_vertex"],
@@ -188,7 +189,9 @@ def quantise(
     return Quantised(result, exponent, declared_bound(exponent, already))
 
 
-def check_bound(source: Mesh, mesh: Mesh, source_face: FaceIds, bound: float) -> float:
+def check_bound(
+    source: Mesh, mesh: Mesh, source_face: FaceIds, bound: float, origin: Origin | None = None
+) -> float:
     """Make sure that every corner of every face is as near to the loaded one as a bound declares.
 
     Args:
@@ -196,6 +199,7 @@ def check_bound(source: Mesh, mesh: Mesh, source_face: FaceIds, bound: float) ->
         mesh: As it is stored.
         source_face: (n,) int32, the loaded face that each face is, from the same first corner.
         bound: In the model's unit.
+        origin: What to add to the stored positions, if anything.
 
     Returns:
         The largest distance found, in float64.
@@ -208,7 +212,8 @@ def check_bound(source: Mesh, mesh: Mesh, source_face: FaceIds, bound: float) ->
         part = slice(begin, begin + CHUNK)
         theirs = source.positions[source.faces[source_face[part]]].astype(np.float64)
         ours = mesh.positions[mesh.faces[part]].astype(np.float64)
-        farthest = max(farthest, float(np.linalg.norm(ours - theirs, axis=2).max(initial=0.0)))
+        away = ours - theirs if origin is None else displacement(theirs, origin, ours)
+        farthest = max(farthest, float(np.linalg.norm(away, axis=2).max(initial=0.0)))
     if not farthest <= bound * SLACK:
         raise StriptoolsError(
             f"a vertex moved by {farthest}, more than the declared {bound}",
@@ -216,6 +221,11 @@ def check_bound(source: Mesh, mesh: Mesh, source_face: FaceIds, bound: float) ->
             remedy="report it",
         )
     return farthest
+
+
+def recentred_bound(cleaned: Cleaned) -> float:
+    """How far positions about an origin may be from the loaded ones: by welding, moving and rounding."""
+    return (cleaned.weld_error + math.sqrt(3.0) * cleaned.largest_rounding) * SLACK
 
 
 def _exponent(mesh: Mesh, precision: PrecisionOptions, already: float) -> int:

@@ -22,8 +22,10 @@ from typing import IO, Any
 import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid, PackedNodes
+from striptools.mesh.attributes import Domain, Material
 from striptools.reducem import check, layout
 from striptools.reducem.archive import expanded
+from striptools.reducem.attributes import Column, check_columns, check_materials, decode_columns
 from striptools.reducem.blocks import Blocks, check_headers
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene
@@ -169,6 +171,10 @@ class _File:
             return self.packed(scene)
         if name == "remap":
             return self.remap()
+        if name == "columns":
+            return self.columns(scene)
+        if name == "materials":
+            return self.materials()
         if name == "metadata":
             return self.metadata()
         return self.of_record(name)
@@ -207,7 +213,7 @@ class _File:
         if most == 0:
             raise unreadable("RDM117", place)
         if not least <= entry.raw_length <= most:
-            raise unreadable("RDM902" if section is layout.METADATA else "RDM114", place)
+            raise unreadable(_TOO_LONG.get(section.kind, "RDM114"), place)
         payload = self.stored(entry)
         if entry.codec == layout.CODEC_RAW:
             return np.frombuffer(payload, np.uint8)
@@ -241,6 +247,9 @@ class _File:
             "grid_exponent": record["grid_exponent"] if record["flags"] & layout.ON_GRID else None,
             "error_bound": record["error_bound"],
             "source_face_count": record["source_face_count"],
+            "origin": np.array([record[f"origin_{axis}"] for axis in "xyz"])
+            if record["flags"] & layout.HAS_ORIGIN
+            else None,
         }
         return fields[name]
 
@@ -293,24 +302,47 @@ class _File:
         check.check_remap(remap, count, faces, self.where)
         return remap
 
+    def columns(self, scene: Scene) -> tuple[Column, ...]:
+        """The attributes, checked."""
+        count = self.record["triangle_count"]
+        raw = self.section(layout.ATTRIBUTES, 0, layout.most_attribute_bytes(count) if count else 0)
+        columns = ()
+        if len(raw):
+            entries: dict[Domain, int] = {"vertex": scene.vertex_count, "corner": 3 * count, "face": count}
+            columns = decode_columns(raw, entries, self.where)
+            check_columns(columns, entries, scene.materials, self.where)
+        elif scene.materials:
+            raise unreadable("RDM117", f"{self.where}: MATL")
+        return columns
+
+    def materials(self) -> tuple[Material, ...]:
+        """What the groups stand for, checked."""
+        most = layout.MATERIALS_LIMIT if self.record["triangle_count"] else 0
+        raw = self.section(layout.MATERIALS, 0, most)
+        return check_materials(self.json(raw, "MATL", "RDM531", "RDM531"), self.where) if len(raw) else ()
+
     def metadata(self) -> dict[str, Any]:
         """The metadata, checked."""
         raw = self.section(layout.METADATA, 0, layout.METADATA_LIMIT)
         if not len(raw):
             return {}
-        place = f"{self.where}: META"
+        metadata = self.json(raw, "META", "RDM901", "RDM904")
+        check.check_metadata(metadata, self.where)
+        return metadata
+
+    def json(self, raw: np.ndarray, kind: str, malformed: str, deep: str) -> Any:
+        """The JSON of a section; `malformed` and `deep` are the codes of what may be wrong with it."""
+        place = f"{self.where}: {kind}"
         try:
             text = raw.tobytes().decode("utf-8")
         except UnicodeDecodeError as error:
-            raise unreadable("RDM901", place) from error
+            raise unreadable(malformed, place) from error
         if _levels(text) > LEVELS:
-            raise unreadable("RDM904", place)
+            raise unreadable(deep, place)
         try:
-            metadata = json.loads(text, parse_int=_integer, parse_constant=_no_number)
+            return json.loads(text, parse_int=_integer, parse_constant=_no_number)
         except ValueError as error:
-            raise unreadable("RDM901", place) from error
-        check.check_metadata(metadata, self.where)
-        return metadata
+            raise unreadable(malformed, place) from error
 
 
 def _table(view: memoryview, where: str) -> dict[bytes, _Entry]:
@@ -368,6 +400,7 @@ def _check_entry(entry: _Entry) -> None:
         raise unreadable("RDM120", entry.place)
 
 
+_TOO_LONG = {layout.METADATA.kind: "RDM902", layout.MATERIALS.kind: "RDM532"}
 _BOUNDS = slice(40, 70)
 """Low, high and cell in the scene record: all bits are zero where there is no triangle."""
 
@@ -379,9 +412,12 @@ def _check_record(record: dict[str, Any], place: str) -> None:
     names = ("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count")
     n, b, m, top, r, faces = (record[name] for name in names)
     stored = record["flags"] & layout.BOXES_STORED
-    if record["flags"] > 3 or record["reserved"] or record["reserved_2"] or any(record["reserved_3"]):
+    if record["flags"] > 7 or record["reserved"] or record["reserved_2"]:
         raise unreadable("RDM107", place)
-    if n == 0 and stored:
+    check.check_origin(
+        [record[f"origin_{axis}"] for axis in "xyz"], bool(record["flags"] & layout.HAS_ORIGIN), place
+    )
+    if n == 0 and record["flags"] & (layout.BOXES_STORED | layout.HAS_ORIGIN):
         raise unreadable("RDM208", place)
     nodes = m >= top + b if stored else m == top
     counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b
@@ -408,11 +444,10 @@ def _array(payload: np.ndarray, stored: str, native: type) -> np.ndarray:
 
 def _levels(text: str) -> int:
     """How deep arrays and objects are nested; brackets in strings do not count."""
-    depth = deepest = 0
-    for token in re.finditer(r'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', text, re.DOTALL):
-        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token[0], 0)
-        deepest = max(deepest, depth)
-    return deepest
+    bare = np.frombuffer(re.sub(r'"(?:[^"\\]|\\.)*"?', "", text, flags=re.DOTALL).encode(), np.uint8)
+    opening = (bare == ord("[")) | (bare == ord("{"))
+    closing = (bare == ord("]")) | (bare == ord("}"))
+    return int(np.cumsum(opening.astype(np.int32) - closing).max(initial=0))
 
 
 def _integer(digits: str) -> int | str:

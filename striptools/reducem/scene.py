@@ -9,9 +9,12 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid, PackedNodes, box_grid, build_inner
+from striptools.mesh.attributes import Attribute, Material, follow
 from striptools.mesh.clean import weld_vertices
 from striptools.mesh.mesh import Mesh
+from striptools.mesh.recentre import Origin
 from striptools.partition.boxes import face_boxes
+from striptools.reducem.attributes import Column, columns_of
 from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, encode_blocks
 from striptools.reducem.layout import LONGEST_RUN
 from striptools.strips.topology import Strips, decode_strips
@@ -56,6 +59,10 @@ class Scene:
         source_face_count: Faces of the source mesh, before cleaning.
         remap: The source's faces, or None where it was left out.
         metadata: For people and tools: a JSON object.
+        columns: The attributes as they are stored; `attributes` gives their values.
+        materials: What the numbers of the attribute `group` stand for.
+        origin: (3,) float64: what to add to positions, bounds and boxes to be where the source is; None where
+            they stand as they are. It is there for float64 sources alone that float32 would not hold well.
     """
 
     blocks: Blocks
@@ -68,6 +75,9 @@ class Scene:
     source_face_count: int
     remap: Remap | None
     metadata: dict[str, Any] = field(default_factory=dict)
+    columns: tuple[Column, ...] = field(default_factory=tuple)
+    materials: tuple[Material, ...] = field(default_factory=tuple)
+    origin: Origin | None = field(default_factory=lambda: None)
 
     @classmethod
     def lazily(cls, load: Callable[[str, "Scene"], object], check: Callable[["Scene"], None]) -> "Scene":
@@ -113,6 +123,16 @@ class Scene:
     def boxes(self) -> BoxesKind:
         """Whether the boxes inside blocks are stored, or rebuilt when they are needed."""
         return "rebuilt" if self.packed.runs is None else "stored"
+
+    @property
+    def attributes(self) -> tuple[Attribute, ...]:
+        """The attributes: of `positions` (`vertex`), of the corners of `faces()`, or of its rows (`face`)."""
+        return tuple(one.attribute for one in self.columns)
+
+    @property
+    def unit(self) -> str | None:
+        """The length that 1 stands for, where the metadata say so."""
+        return self.metadata.get("unit")
 
     @cached_property
     def _totals(self) -> dict[str, int]:
@@ -207,17 +227,25 @@ class Scene:
         Returns:
             Vertices that are equal bit for bit are one again, in the order of their first block. With a
             remap, the faces in the source's order, each from the source's first corner; without one, in
-            file order from the decoded first corner.
+            file order from the decoded first corner. Attributes, materials and unit as they were. Positions
+            are float64, where the source is, where there is an origin, else float32.
         """
-        faces = self.faces()
+        faces, attributes = self.faces(), self.attributes
+        order = np.arange(len(faces), dtype=np.int32)
         if self.remap is not None:
             back = (np.arange(3) - self.remap.rotation[:, None]) % 3
-            order = np.argsort(self.remap.face, kind="stable")
-            faces = np.take_along_axis(faces, back, axis=1)[order]
+            order = np.argsort(self.remap.face, kind="stable").astype(np.int32)
+            faces = np.take_along_axis(faces, back, axis=1)
+            attributes = tuple(_turned(one, back) for one in attributes)
         leader = self.leaders
         is_leader = leader == np.arange(len(leader), dtype=np.int32)
         place = np.cumsum(is_leader, dtype=np.int32) - np.int32(1)
-        return Mesh(self.positions[is_leader], np.ascontiguousarray(place[leader[faces]]))
+        welded = np.ascontiguousarray(place[leader[faces[order]]])
+        attributes, _ = follow(attributes, faces, order, welded, np.flatnonzero(is_leader))
+        positions = self.positions[is_leader]
+        if self.origin is not None:
+            positions = positions.astype(np.float64) + self.origin
+        return Mesh(positions, welded, (), attributes, self.materials, self.unit)
 
     def save(self, target: str | Path | IO[bytes], *, archive: bool = False) -> int:
         """Write a scene file; the same scene gives the same bytes.
@@ -244,17 +272,31 @@ class Scene:
 
         Returns:
             Bytes of `positions`, `connectivity` (start, turn and flip bits, and indices),
-            `in_block_hierarchy`, `block_headers`, `top_level`, `remap` and `container` (header, table,
-            scene record, metadata, and what fills up words and sections); their sum is the file's length.
+            `in_block_hierarchy`, `block_headers`, `top_level`, `remap`, `attributes` (materials too) and
+            `container` (header, table, scene record, metadata, and what fills up words and sections); their
+            sum is the file's length.
         """
         from striptools.reducem.writer import part_sizes
 
         return part_sizes(self)
 
     def bytes_per_triangle(self) -> float:
-        """Say what a triangle costs: every byte of the file but the remap's, over the triangles."""
+        """Say what a triangle costs: every byte of the file but the remap's and attributes', over them."""
         parts = self.part_bytes()
-        return (sum(parts.values()) - parts["remap"]) / max(1, self.triangle_count)
+        beside = parts["remap"] + parts["attributes"]
+        return (sum(parts.values()) - beside) / max(1, self.triangle_count)
+
+    def attribute_bytes(self) -> dict[str, int]:
+        """Count the bytes of each attribute in the file, by its name."""
+        return {one.name: one.byte_count for one in self.columns}
+
+    def with_attributes(self, mesh: Mesh, strips: Strips) -> "Scene":
+        """The same scene with the attributes and materials of the mesh whose strips it holds."""
+        if not mesh.attributes:
+            return self
+        columns = columns_of(mesh, strips, self.faces(), self.vertex_count)
+        materials = mesh.materials if mesh.attribute("group") is not None else ()
+        return replace(self, columns=columns, materials=materials)
 
     def resident_bytes_per_triangle(self) -> float:
         """Say what tracing without unpacking holds, blocks and complete hierarchy, over the triangles."""
@@ -264,6 +306,15 @@ class Scene:
 
 
 _FIELDS = frozenset(f.name for f in fields(Scene))
+
+
+def _turned(one: Attribute, back: np.ndarray) -> Attribute:
+    """An attribute with the corners of each triangle in another order."""
+    if one.domain != "corner":
+        return one
+    corners = one.values.reshape(len(back), 3, one.values.shape[1])
+    values = np.take_along_axis(corners, back[:, :, None], axis=1)
+    return Attribute(one.name, "corner", values.reshape(one.values.shape))
 
 
 def scene_from_strips(
@@ -277,6 +328,7 @@ def scene_from_strips(
     grid_exponent: int | None = None,
     error_bound: float = 0.0,
     metadata: dict[str, Any] | None = None,
+    origin: Origin | None = None,
     threads: int = 1,
 ) -> Scene:
     """Put a scene together from strips in blocks; the boxes inside blocks are to be rebuilt.
@@ -291,6 +343,7 @@ def scene_from_strips(
         grid_exponent: See `Scene`.
         error_bound: See `Scene`.
         metadata: See `Scene`.
+        origin: See `Scene`.
         threads: How many threads share the work; the scene is the same for any number.
 
     Raises:
@@ -310,6 +363,7 @@ def scene_from_strips(
         source_face_count=int(source_face_count),
         remap=None if source_face is None else _remap(source_face, strips, threads),
         metadata=dict(metadata or {}),
+        origin=origin,
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.issues import ISSUES, Finding
+from striptools.reducem.validate_attributes import inspect_attributes, inspect_materials
 from striptools.reducem.validate_blocks import inspect_blocks
 from striptools.reducem.validate_nodes import inspect_nodes
 from striptools.reducem.validate_packed import unpack
@@ -24,8 +25,11 @@ from striptools.reducem.validate_packed import unpack
 __all__ = ["validate"]
 
 _NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
-_KNOWN = (*_NEEDED, "RMAP", "META")
+_OPTIONAL = ("RMAP", "ATTR", "MATL", "META")
+_KNOWN = (*_NEEDED, *_OPTIONAL)
 _MOST_METADATA = 2**20
+_MOST_MATERIALS = 2**22
+_TOO_LONG = {"META": "RDM902", "MATL": "RDM532"}
 _MOST_LEVELS = 32
 
 
@@ -182,7 +186,7 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
     for kind, entry in first.items():
         _decode(inspection, entry, lengths[kind])
     for kind, (least, _) in lengths.items():
-        if least and kind not in first and kind not in ("RMAP", "META"):
+        if least and kind not in first and kind not in _OPTIONAL:
             inspection.found("RDM113", kind, 32)
     return True
 
@@ -192,7 +196,9 @@ def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str
     runs, remap = (4 * b + 2 * r) * stored, 4 * n + -(-n // 4)
     lengths = {"BLKH": (32 * b, 32 * b), "BLKD": (64, 3936 * b + 128) if b else (0, 0)}
     lengths |= {"NODE": (64 * m, 64 * m), "RUNS": (runs, runs)}
-    return lengths | {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
+    lengths |= {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
+    beside = {"ATTR": (1, 256 * (n + 1)), "MATL": (1, _MOST_MATERIALS)}
+    return lengths | (beside if n else dict.fromkeys(beside, (0, 0)))
 
 
 def _decode(inspection: Inspection, entry: _Entry, lengths: tuple[int, int]) -> None:
@@ -201,8 +207,7 @@ def _decode(inspection: Inspection, entry: _Entry, lengths: tuple[int, int]) -> 
     if lengths[1] == 0:
         return inspection.found("RDM117", entry.place, entry.at)
     if not lengths[0] <= entry.raw_length <= lengths[1]:
-        code = "RDM902" if entry.kind == "META" else "RDM114"
-        return inspection.found(code, entry.place, entry.at + 24)
+        return inspection.found(_TOO_LONG.get(entry.kind, "RDM114"), entry.place, entry.at + 24)
     payload = inspection.data[entry.offset : entry.end]
     if entry.codec == 1:
         code, payload = unpack(payload, entry.raw_length)
@@ -226,9 +231,22 @@ def _contents(inspection: Inspection) -> bool:
             inspect_nodes(inspection, geometry)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])
+    _beside(inspection)
     if "META" in sections:
         _metadata(inspection, sections["META"])
     return True
+
+
+def _beside(inspection: Inspection) -> None:
+    """Look at attributes and materials."""
+    sections, materials = inspection.sections, 0
+    if "MATL" in sections:
+        rows = _json(inspection, sections["MATL"], "RDM531", "RDM531")
+        materials = None if rows is _NO_JSON else inspect_materials(inspection, sections["MATL"], rows)
+    if "ATTR" in sections and "BLKH" in sections:
+        inspect_attributes(inspection, sections["ATTR"], materials)
+    elif "MATL" in sections and "ATTR" not in inspection.undecoded and "ATTR" not in sections:
+        inspection.found("RDM117", "MATL", sections["MATL"].offset)
 
 
 def _record(inspection: Inspection, section: Section) -> None:
@@ -237,7 +255,7 @@ def _record(inspection: Inspection, section: Section) -> None:
     reserved_2 = section.data[28:32] != bytes(4)
     *cells, longest = struct.unpack_from("<3hH", section.data, 64)
     stored = flags & 1
-    for at, wrong in ((24, flags > 3), (25, reserved), (28, reserved_2), (72, any(section.data[72:]))):
+    for at, wrong in ((24, flags > 7), (25, reserved), (28, reserved_2)):
         if wrong:
             inspection.found("RDM107", "SCEN", section.at(at))
     counts = (
@@ -258,7 +276,10 @@ def _record(inspection: Inspection, section: Section) -> None:
             inspection.found("RDM206", "SCEN", section.at(64 + 2 * axis))
     if not (1 <= longest <= 8 if stored else longest == 0):
         inspection.found("RDM207", "SCEN", section.at(70))
-    _empty(inspection, section, n, stored)
+    origin = struct.unpack_from("<3d", section.data, 72)
+    if not all(map(math.isfinite, origin)) or not (any(origin) if flags & 4 else not any(section.data[72:])):
+        inspection.found("RDM209", "SCEN", section.at(72))
+    _empty(inspection, section, n, flags & 5)
 
 
 def _numbers(inspection: Inspection, section: Section) -> None:
@@ -272,10 +293,10 @@ def _numbers(inspection: Inspection, section: Section) -> None:
             break
 
 
-def _empty(inspection: Inspection, section: Section, triangles: int, stored: int) -> None:
+def _empty(inspection: Inspection, section: Section, triangles: int, more: int) -> None:
     """Look at what an empty scene must not have; its counts are looked at with the others."""
     if triangles == 0:
-        if stored:
+        if more:
             inspection.found("RDM208", "SCEN", section.at(24))
         rest = section.data[40:70].lstrip(b"\0")
         if rest:
@@ -302,26 +323,46 @@ def _remap(inspection: Inspection, section: Section) -> None:
 
 
 def _metadata(inspection: Inspection, section: Section) -> None:
-    """Look at the metadata; nothing is followed down before its depth is known."""
-    try:
-        text = section.data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        return inspection.found("RDM901", "META", section.at(error.start))
-    if _levels(text) > _MOST_LEVELS:
-        return inspection.found("RDM904", "META", section.offset)
-    try:
-        # Every number is 0 here: Python refuses more than 4,300 digits, JSON does not.
-        metadata = json.loads(text, parse_int=lambda _: 0, parse_constant=_no_number)
-    except json.JSONDecodeError as error:
-        return inspection.found("RDM901", "META", section.at(len(text[: error.pos].encode())))
-    except ValueError:
-        return inspection.found("RDM901", "META", section.offset)
+    """Look at the metadata."""
+    metadata = _json(inspection, section, "RDM901", "RDM904")
+    if metadata is _NO_JSON:
+        return None
     if not isinstance(metadata, dict):
         return inspection.found("RDM901", "META", section.offset)
     for name in ("generator", "source", "unit"):
         if not isinstance(metadata.get(name, ""), str):
             inspection.found("RDM903", f"META: {name}", section.offset)
     return None
+
+
+def _json(inspection: Inspection, section: Section, malformed: str, deep: str) -> object:
+    """The JSON of a section, or that there is none; nothing is followed down before its depth is known."""
+    kind = section.kind
+    try:
+        text = section.data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return _refused(inspection, malformed, kind, section.at(error.start))
+    if _levels(text) > _MOST_LEVELS:
+        return _refused(inspection, deep, kind, section.offset)
+    try:
+        return json.loads(text, parse_int=_small, parse_constant=_no_number)
+    except json.JSONDecodeError as error:
+        return _refused(inspection, malformed, kind, section.at(len(text[: error.pos].encode())))
+    except ValueError:
+        return _refused(inspection, malformed, kind, section.offset)
+
+
+_NO_JSON = object()
+
+
+def _refused(inspection: Inspection, code: str, place: str, offset: int) -> object:
+    inspection.found(code, place, offset)
+    return _NO_JSON
+
+
+def _small(digits: str) -> int:
+    # Python refuses to read more than 4,300 digits, JSON does not.
+    return int(digits) if len(digits) < 4 else 9999
 
 
 def _levels(text: str) -> int:

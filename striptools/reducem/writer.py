@@ -15,6 +15,7 @@ import numpy as np
 from striptools.mesh.atomic import write_atomically, write_stream
 from striptools.reducem import layout
 from striptools.reducem.archive import compressed
+from striptools.reducem.attributes import encode_columns, encode_materials, section_length
 from striptools.reducem.check import check_scene
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene
@@ -75,6 +76,7 @@ def part_sizes(scene: Scene) -> dict[str, int]:
     parts["top_level"] = layout.NODE_RECORD.size * packed.top_count
     parts["in_block_hierarchy"] = lengths[layout.NODES.kind] - parts["top_level"] + lengths[layout.RUNS.kind]
     parts["remap"] = lengths[layout.REMAP.kind]
+    parts["attributes"] = lengths[layout.ATTRIBUTES.kind] + lengths[layout.MATERIALS.kind]
     present = [length for length in lengths.values() if length]
     total = _table_end(len(present)) + sum(map(layout.aligned, present))
     parts["container"] = total - sum(parts.values())
@@ -92,6 +94,8 @@ def _lengths(scene: Scene) -> dict[bytes, int]:
         boxes_stored=packed.runs is not None,
     )
     lengths[layout.BLOCK_DATA.kind] = scene.blocks.words.nbytes
+    lengths[layout.ATTRIBUTES.kind] = section_length(scene.columns)
+    lengths[layout.MATERIALS.kind] = len(encode_materials(scene.materials))
     lengths[layout.METADATA.kind] = len(_metadata(scene.metadata))
     if scene.remap is None:
         lengths[layout.REMAP.kind] = 0
@@ -122,6 +126,8 @@ def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
         (layout.NODES, _view(packed.nodes, "<u4")),
         (layout.RUNS, runs),
         (layout.REMAP, _remap(scene.remap)),
+        (layout.ATTRIBUTES, encode_columns(scene.columns)),
+        (layout.MATERIALS, encode_materials(scene.materials)),
         (layout.METADATA, _metadata(scene.metadata)),
     ]
 
@@ -151,15 +157,19 @@ def _scene_record(scene: Scene) -> bytes:
     record["top_count"] = packed.top_count
     record["run_count"] = 0 if packed.runs is None else len(packed.runs)
     record["source_face_count"] = scene.source_face_count
-    record["flags"] = (0 if packed.runs is None else layout.BOXES_STORED) | (
-        0 if scene.grid_exponent is None else layout.ON_GRID
+    flags = (
+        (packed.runs is not None, layout.BOXES_STORED),
+        (scene.grid_exponent is not None, layout.ON_GRID),
+        (scene.origin is not None, layout.HAS_ORIGIN),
     )
+    record["flags"] = sum(bit for there, bit in flags if there)
     record["grid_exponent"] = scene.grid_exponent or 0
     record["error_bound"] = scene.error_bound
     for axis, name in enumerate("xyz"):
         record[f"low_{name}"] = scene.low[axis]
         record[f"high_{name}"] = scene.high[axis]
         record[f"cell_{name}"] = scene.grid.cell[axis]
+        record[f"origin_{name}"] = 0.0 if scene.origin is None else scene.origin[axis]
     record["longest_run"] = packed.longest_run
     return record.tobytes()
 

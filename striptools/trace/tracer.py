@@ -35,6 +35,10 @@ class Tracer:
     of least t, then of least source face. A ray with a component that is not finite, or with a direction of
     zero, hits nothing.
 
+    Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
+    float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
+    before; t, u and v are the same in both.
+
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
 
@@ -66,6 +70,7 @@ class Tracer:
     ) -> None:
         _check_kinds(hierarchy, resident)
         devices = trace_devices(device, threads)
+        self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         self._on_gpu = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
         if resident == "auto":
@@ -95,6 +100,11 @@ class Tracer:
     def devices(self) -> list[Any]:
         """The JAX devices in use."""
         return list(self._mesh.devices.flat)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) float64: where the zero of the rays' frame lies in the source's; zeros where they are one."""
+        return self._origin.copy()
 
     @property
     def resident(self) -> ResidentKind:

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-MUST_UNDERSTAND = {"SCEN": 1, "BLKH": 1, "BLKD": 1, "NODE": 1, "RUNS": 1, "RMAP": 0, "META": 0}
+MUST_UNDERSTAND = {"SCEN": 1, "BLKH": 1, "BLKD": 1, "NODE": 1, "RUNS": 1}
+MUST_UNDERSTAND |= {"RMAP": 0, "ATTR": 0, "MATL": 0, "META": 0}
 MOST_DEEP = 32
 """Levels of arrays and objects in metadata."""
 
@@ -56,6 +57,9 @@ class Scene:
         remap: `(face, rotation)` of each triangle, or None.
         nodes: The nodes in their order.
         runs: For each block its runs `(first triangle, triangles)`; None where boxes are not stored.
+        attributes: For each name `(domain, values)`: a row for each block vertex, corner or triangle, whose
+            f32 are 32-bit patterns.
+        materials: The array of MATL; empty where there is none.
         metadata: The object of META; empty where there is none.
         passed_over: The kinds of sections that this reader does not know.
     """
@@ -68,6 +72,8 @@ class Scene:
     remap: list | None = None
     nodes: list = field(default_factory=list)
     runs: list | None = None
+    attributes: dict = field(default_factory=dict)
+    materials: list = field(default_factory=list)
     metadata: dict = field(default_factory=dict)
     passed_over: list = field(default_factory=list)
 
@@ -95,6 +101,12 @@ def read(data):
     check_nodes(scene)
     if "RMAP" in sections:
         scene.remap = read_remap(record, sections["RMAP"])
+    if "MATL" in sections:
+        scene.materials = read_materials(sections["MATL"])
+    if "ATTR" in sections:
+        scene.attributes = read_attributes(scene, sections["ATTR"])
+    if scene.materials and "GRUP" not in scene.attributes:
+        raise RefusedError("4", "MATL is there and not needed")
     if "META" in sections:
         scene.metadata = read_metadata(sections["META"])
     return scene
@@ -176,12 +188,12 @@ def align(x):
 
 # Section 4.1: the scene record
 
-RECORD = struct.Struct("<6IBBhId6f3hH24s")
+RECORD = struct.Struct("<6IBBhId6f3hH3d")
 FIELDS = (
     *("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count"),
     *("flags", "reserved", "grid_exponent", "reserved_2", "error_bound"),
     *("low_x", "low_y", "low_z", "high_x", "high_y", "high_z", "cell_x", "cell_y", "cell_z"),
-    *("longest_run", "reserved_3"),
+    *("longest_run", "origin_x", "origin_y", "origin_z"),
 )
 
 
@@ -194,8 +206,13 @@ def read_record(payload):
     record["low"] = [record[f"low_{axis}"] for axis in "xyz"]
     record["high"] = [record[f"high_{axis}"] for axis in "xyz"]
     record["cell"] = [record[f"cell_{axis}"] for axis in "xyz"]
-    if record["flags"] > 3 or record["reserved"] or record["reserved_2"] or any(record["reserved_3"]):
+    if record["flags"] > 7 or record["reserved"] or record["reserved_2"]:
         raise RefusedError("4.1", "a reserved field is not zero")
+    origin = [record[f"origin_{axis}"] for axis in "xyz"]
+    if not all(map(math.isfinite, origin)):
+        raise RefusedError("4.1", "the origin is not finite")
+    if not any(origin) if record["flags"] & 4 else any(payload[72:]):
+        raise RefusedError("4.1", "the origin is zero, or there without its flag")
     if not (math.isfinite(record["error_bound"]) and record["error_bound"] >= 0):
         raise RefusedError("4.1", "the error bound is negative or not finite")
     if not (-149 <= record["grid_exponent"] <= 104 if record["grid"] else record["grid_exponent"] == 0):
@@ -224,8 +241,8 @@ def check_counts(record):
 
 def check_empty(record, payload):
     """Refuse an empty scene with anything in it."""
-    if record["stored"] or any(payload[40:70]):
-        raise RefusedError("4.1", "an empty scene with stored boxes, bounds or cells")
+    if record["flags"] & 5 or any(payload[40:70]):
+        raise RefusedError("4.1", "an empty scene with stored boxes, bounds, cells or an origin")
 
 
 def check_lengths(record, sections):
@@ -488,7 +505,7 @@ def check_nodes(scene):
         raise RefusedError("4.4", "a node, block or run has no parent, or should have none")
 
 
-# Sections 4.6 and 4.7: remap and metadata
+# Section 4.6: the remap
 
 
 def read_remap(record, payload):
@@ -503,21 +520,120 @@ def read_remap(record, payload):
     return list(zip(faces, rotations[:n], strict=True))
 
 
+# Sections 4.7 and 4.8: attributes and materials
+
+ATTRIBUTES = {
+    "NORM": ((3,), (0,), (0, 1, 2)),
+    "TEXC": ((2,), (0,), (0, 1, 2)),
+    "COLR": ((3, 4), (0, 1, 2), (0, 1, 2)),
+    "GRUP": ((1,), (3,), (2,)),
+}
+"""The components, types and domains that an attribute may have."""
+LETTERS = "IBHI"
+"""What `struct` calls the types; the bits of an f32 stay bits."""
+
+
+def read_attributes(scene, payload):
+    """For each name its domain and the value of each entry."""
+    if len(payload) > 256 * (scene.record["triangle_count"] + 1) or len(payload) < 8:
+        raise RefusedError("4.7", "more bytes than there may be, or too few")
+    count, reserved = struct.unpack_from("<II", payload)
+    if not 1 <= count <= 4 or reserved or 8 + 16 * count > len(payload):
+        raise RefusedError("4.7", "not 1 to 4 attributes, or a reserved word is set")
+    at, found = 8 + 16 * count, {}
+    for i in range(count):
+        name, *fields = struct.unpack_from("<4sBBBBII", payload, 8 + 16 * i)
+        name = name.decode("latin-1")
+        if name in found:
+            raise RefusedError("4.7", f"{name} is there twice")
+        found[name], at = read_attribute(scene, payload, at, name, *fields)
+    if at != len(payload):
+        raise RefusedError("4.7", "bytes behind the last attribute")
+    return found
+
+
+def read_attribute(scene, payload, at, name, domain, components, kind, width, rows, reserved):
+    """The domain and values of one attribute, whose data begin at a byte, and where they end."""
+    allowed = ATTRIBUTES.get(name)
+    if allowed is None or components not in allowed[0] or kind not in allowed[1] or domain not in allowed[2]:
+        raise RefusedError("4.7", f"{name!r}: no such attribute")
+    triangles = scene.record["triangle_count"]
+    entries = (len(scene.vertices), 3 * triangles, triangles)[domain]
+    wanted = 0 if rows == entries else (rows - 1).bit_length()
+    if reserved or not 1 <= rows <= entries or width != wanted:
+        raise RefusedError("4.7", f"{name}: a reserved word, no or too many rows, or another width")
+    layout = struct.Struct(f"<{components}{LETTERS[kind]}")
+    middle = at + rows * layout.size
+    begin = middle + -middle % 4
+    end = begin + 4 * ((width * entries + 31) // 32)
+    if end > len(payload):
+        raise RefusedError("4.7", f"{name}: the data end too early")
+    stream = int.from_bytes(payload[begin:end], "little")
+    if any(payload[middle:begin]) or stream >> width * entries:
+        raise RefusedError("4.7", f"{name}: an unused bit is set")
+    table = list(layout.iter_unpack(payload[at:middle]))
+    index = [stream >> width * j & (1 << width) - 1 for j in range(entries)]
+    index = list(range(entries)) if rows == entries else index
+    check_rows(scene, name, table, index)
+    return (domain, [table[i] for i in index]), end
+
+
+def check_rows(scene, name, table, index):
+    """Refuse rows that are not used in the order of their numbers, are there twice, or name no material."""
+    largest = -1
+    for i in index:
+        if i > largest + 1:
+            raise RefusedError("4.7", f"{name}: rows are not in the order of their first use")
+        largest = max(largest, i)
+    if largest != len(table) - 1 or len(set(table)) < len(table):
+        raise RefusedError("4.7", f"{name}: an index without a row, a row without an index, or a row twice")
+    if name == "GRUP" and any(row[0] >= len(scene.materials) for row in table):
+        raise RefusedError("4.7", "a group has no material")
+
+
+def read_materials(payload):
+    """The array of MATL."""
+    if len(payload) > 2**22:
+        raise RefusedError("4.8", "more than 2^22 bytes")
+    materials = read_json("4.8", payload)
+    if not isinstance(materials, list) or not 1 <= len(materials) <= 65536:
+        raise RefusedError("4.8", "no array of 1 to 65,536 materials")
+    for material in materials:
+        if not isinstance(material, dict) or not set(material) <= {"name", "base_color", "group"}:
+            raise RefusedError("4.8", "no material")
+        colour = material.get("base_color")
+        names = (material.get("name"), material.get("group", ""))
+        if not all(type(name) is str for name in names) or not isinstance(colour, list) or len(colour) != 4:
+            raise RefusedError("4.8", "a material without a name or colour, or of another type")
+        if not all(type(x) is Number and 0 <= float(x) <= 1 for x in colour):
+            raise RefusedError("4.8", "a colour that is not 0 to 1")
+        material["base_color"] = [float(x) for x in colour]
+    return materials
+
+
+# Section 4.9: metadata
+
+
 def read_metadata(payload):
     """The object of META."""
     if len(payload) > 2**20:
-        raise RefusedError("4.7", "more than 2^20 bytes")
+        raise RefusedError("4.9", "more than 2^20 bytes")
+    metadata = read_json("4.9", payload)
+    if not isinstance(metadata, dict):
+        raise RefusedError("4.9", "no JSON object")
+    if not all(type(metadata.get(name, "")) is str for name in ("generator", "source", "unit")):
+        raise RefusedError("4.9", "generator, source or unit is no string")
+    return metadata
+
+
+def read_json(clause, payload):
+    """What a section of JSON holds, its numbers as they are written."""
     try:
         text = payload.decode("utf-8")
-        check_depth(text)
-        metadata = json.loads(text, parse_int=Number, parse_float=Number, parse_constant=refuse_constant)
+        check_depth(clause, text)
+        return json.loads(text, parse_int=Number, parse_float=Number, parse_constant=refuse_constant)
     except ValueError as error:
-        raise RefusedError("4.7", f"no JSON in UTF-8: {error}") from None
-    if not isinstance(metadata, dict):
-        raise RefusedError("4.7", "no JSON object")
-    if not all(type(metadata.get(name, "")) is str for name in ("generator", "source", "unit")):
-        raise RefusedError("4.7", "generator, source or unit is no string")
-    return metadata
+        raise RefusedError(clause, f"no JSON in UTF-8: {error}") from None
 
 
 class Number(str):
@@ -526,7 +642,7 @@ class Number(str):
     __slots__ = ()
 
 
-def check_depth(text):
+def check_depth(clause, text):
     """Refuse arrays and objects nested too deep, before anything follows them down."""
     depth, in_string, escaped = 0, False, False
     for letter in text:
@@ -540,7 +656,7 @@ def check_depth(text):
         elif letter in "]}":
             depth -= 1
         if depth > MOST_DEEP:
-            raise RefusedError("4.7", f"nested deeper than {MOST_DEEP}")
+            raise RefusedError(clause, f"nested deeper than {MOST_DEEP}")
 
 
 def refuse_constant(name):
@@ -566,7 +682,10 @@ def summary(scene):
         "high": record["high"],
         "error bound": record["error_bound"],
         "grid": f"2^{record['grid_exponent']}" if record["grid"] else "none",
+        "origin": [record[f"origin_{axis}"] for axis in "xyz"] if record["flags"] & 4 else "none",
         "remap": "yes" if scene.remap else "no",
+        "attributes": ", ".join(scene.attributes) or "none",
+        "materials": ascii(scene.materials),
         "metadata": ascii(scene.metadata),
         "passed over": ascii(scene.passed_over),
     }

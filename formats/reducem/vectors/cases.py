@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
-from make import Axis, Block, Node, Plan, Slot, Strip, decoding, encode, f32
+from make import Axis, Block, Node, Plan, Slot, Strip, Values, bits32, decoding, encode, f32
 
 LONGEST_LINE = 800
 BIG = f32(0x7F7FFFFF)
@@ -87,6 +87,8 @@ def valid_plans() -> dict[str, tuple[str, Plan]]:
         "error_bound": ("a bound, and all the source faces there may be", _bound()),
     }
     for group in (_turns(), _limits(), _widths(), _exponents(), _floats(), _boxes(), _containers(), _sides()):
+        made |= group
+    for group in (_attributes(), _origins()):
         made |= group
     return made
 
@@ -310,6 +312,54 @@ def _containers() -> dict[str, tuple[str, Plan]]:
     }
 
 
+UP, EAST = tuple(map(bits32, (0.0, 0.0, 1.0))), tuple(map(bits32, (1.0, 0.0, -0.0)))
+NAN = 0x7FC00001
+RED = {"name": "red", "base_color": [1, 0.0, 0, 1]}
+GLASS = {"name": "", "base_color": [0.5, 0.5, 1e-3, 0], "group": "gl\u00e4s\u0001"}
+PAIR = Plan(blocks_of(2))
+"""Four triangles, eight block vertices."""
+COLOURS = Values("COLR", 2, 1, [(1, 2, 3), (255, 0, 0), (9, 9, 9)], [0, 1, 1, 2])
+GROUPS = Values("GRUP", 2, 3, [(1,), (0,)], [0, 0, 1, 0])
+
+
+def _attributes() -> dict[str, tuple[str, Plan]]:
+    shorts = [(i, 65535, 7 * i, 1) for i in range(4)]
+    corners = [tuple(map(bits32, (i / 4, -i))) for i in range(12)]
+    every = [
+        Values("TEXC", 1, 0, [(NAN, 0x80000000), (0, 1), (NAN, 0)], [0, 1, 2, 1] * 3),
+        Values("NORM", 0, 0, [UP, EAST], [0, 1] * 4),
+        GROUPS,
+        Values("COLR", 2, 2, shorts, None),
+    ]
+    packed = {"ATTR": frame, "MATL": frame}
+    plans = {
+        "of_vertices": Plan(
+            PAIR.blocks, attributes=[Values("NORM", 0, 0, [UP, EAST], [0, 0, 1] * 2 + [0, 1])]
+        ),
+        "of_corners": Plan(PAIR.blocks, attributes=[Values("TEXC", 1, 0, corners, None)]),
+        "of_triangles": Plan(PAIR.blocks, attributes=[COLOURS]),
+        "of_one_row": Plan(PAIR.blocks, attributes=[Values("COLR", 0, 0, [UP], [0] * 8)]),
+        "of_one_entry": Plan([TRIANGLE], attributes=[Values("COLR", 2, 1, [(1, 2, 3, 4)], None)]),
+        "of_every_name": Plan(PAIR.blocks, attributes=every, materials=[RED, GLASS]),
+        "packed": Plan(PAIR.blocks, attributes=every, materials=[RED, GLASS], packed=packed),
+        "turned": Plan(
+            [Block(FLIPPED, points(8))],
+            attributes=[Values("TEXC", 1, 0, [(bits32(i), 0) for i in range(18)], None)],
+            remap=[(i, i % 3) for i in range(6)],
+        ),
+    }
+    return {f"attributes_{name}": ("values of its name", plan) for name, plan in plans.items()}
+
+
+def _origins() -> dict[str, tuple[str, Plan]]:
+    origin = {"flags": 4, "origin_x": 4.5e5, "origin_y": -5.5e6, "error_bound": 2.0**-20}
+    tiny = {"flags": 4, "origin_z": -5e-324}
+    return {
+        "origin": ("positions about an origin", Plan([TRIANGLE], record=origin)),
+        "origin_tiny": ("the smallest origin", Plan([TRIANGLE], record=tiny)),
+    }
+
+
 def _windowed() -> Plan:
     def pack(data: bytes) -> bytes:
         return frame(data, descriptor=0, tail=b"")[:5] + bytes([0x88]) + frame(data, descriptor=0)[5:]
@@ -348,7 +398,16 @@ def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
     made: dict[str, tuple[str, list[str], bytes]] = {}
     for group in (_cut(), _headers(), _entries(), _needs(), _records(), _block_headers(), _block_data()):
         made |= group
-    for group in (_coordinates(), _nodes(), _runs(), _remaps(), _metadata(), _packed()):
+    for group in (
+        _coordinates(),
+        _nodes(),
+        _runs(),
+        _remaps(),
+        _metadata(),
+        _packed(),
+        _values(),
+        _materials(),
+    ):
         made |= group
     return made
 
@@ -524,10 +583,14 @@ def _records() -> dict[str, tuple[str, list[str], bytes]]:
         "run_count": field("fewer runs than blocks", "RDM114 RDM201", run_count=1),
         "runs_without_boxes": field("runs and no stored boxes", "RDM201", ONE, run_count=1),
         "source_faces": field("fewer source faces than triangles", "RDM201", ONE, source_face_count=0),
-        "flags": field("a reserved flag", "RDM107", ONE, flags=4),
+        "flags": field("a reserved flag", "RDM107", ONE, flags=8),
         "reserved": field("a reserved byte", "RDM107", ONE, reserved=1),
         "reserved_2": field("a reserved word", "RDM107", ONE, reserved_2=1 << 31),
-        "reserved_3": field("a reserved byte at the end", "RDM107", ONE, reserved_3=bytes(23) + b"\1"),
+        "origin_without": field("an origin and no flag", "RDM209", ONE, origin_x=1.0),
+        "origin_minus_zero": field("-0.0 where there is no origin", "RDM209", ONE, origin_z=-0.0),
+        "origin_zero": field("an origin of zero", "RDM209", ONE, flags=4, origin_y=-0.0),
+        "origin_nan": field("an origin that is no number", "RDM209", ONE, flags=4, origin_y=nan),
+        "origin_infinite": field("an origin far away", "RDM209", ONE, flags=4, origin_x=float("inf")),
         "grid_without": field("a grid exponent and no grid", "RDM203", ONE, grid_exponent=1),
         "grid_low": field("a grid finer than any", "RDM203", Plan([TRIANGLE], grid=0), grid_exponent=-150),
         "grid_high": field("a grid coarser than any", "RDM203", Plan([TRIANGLE], grid=0), grid_exponent=105),
@@ -547,6 +610,7 @@ def _records() -> dict[str, tuple[str, list[str], bytes]]:
         "longest_nine": field("a longest run of nine", "RDM207", BOX, longest_run=9),
         "longest_without": field("a longest run and no stored boxes", "RDM207", ONE, longest_run=8),
         "empty_stored": field("an empty scene with stored boxes", "RDM208", Plan([]), flags=1, longest_run=1),
+        "empty_origin": field("an empty scene with an origin", "RDM208", Plan([]), flags=4, origin_x=1.0),
         "empty_bounds": field("an empty scene with bounds", "RDM208", Plan([]), high_z=-0.0),
         "empty_cell": field("an empty scene with cells", "RDM208", Plan([]), cell_y=1),
         "empty_nodes": field("an empty scene with nodes", "RDM113 RDM201", Plan([]), node_count=1),
@@ -839,6 +903,110 @@ def _metadata() -> dict[str, tuple[str, list[str], bytes]]:
     about = "metadata that are not what they must be"
     return {
         f"metadata_{name}": wrong(about, codes, ONE, metadata=text) for name, (text, codes) in texts.items()
+    }
+
+
+def _values() -> dict[str, tuple[str, list[str], bytes]]:
+    def of(about: str, codes: str, *values: Values, **changes) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, PAIR, attributes=list(values), **changes)
+
+    def spoiled(about: str, codes: str, **fields) -> tuple[str, list[str], bytes]:
+        return of(about, codes, COLOURS._replace(record=fields))
+
+    def changed(about: str, codes: str, change: Callable[[bytes], bytes]) -> tuple[str, list[str], bytes]:
+        return of(about, codes, COLOURS, payloads={"ATTR": change})
+
+    two = {"materials": [RED, GLASS]}
+    many = Plan(blocks_of(1), attributes=[COLOURS._replace(index=[0, 1])])
+    return {
+        "values_name": spoiled("an unknown name", "RDM521", name=b"TANG"),
+        "values_twice": of("a name twice", "RDM521", COLOURS, COLOURS),
+        "values_domain": spoiled("an unknown domain", "RDM521", domain=3),
+        "values_type": spoiled("a type that it cannot have", "RDM521", type=3),
+        "values_type_unknown": spoiled("an unknown type", "RDM521", type=4),
+        "values_components": spoiled("too few components", "RDM521", components=2),
+        "values_group_domain": of(
+            "groups of corners", "RDM521", GROUPS._replace(record={"domain": 1}), **two
+        ),
+        "values_reserved": spoiled("a reserved word", "RDM107", reserved=1),
+        "values_head": changed("a reserved word before the records", "RDM107", patched(4, "I", 1)),
+        "values_none": changed("no attribute", "RDM521", patched(0, "I", 0)),
+        "values_five": changed("more attributes than there are names", "RDM521", patched(0, "I", 5)),
+        "values_four": changed(
+            "records behind the end", "RDM522", lambda data: struct.pack("<I", 4) + data[4:24]
+        ),
+        "values_short_head": changed("the end before the records", "RDM522", lambda data: data[:7]),
+        "values_short": changed("four bytes too few", "RDM522", lambda data: data[:-4]),
+        "values_long": changed("four bytes too many", "RDM522", lambda data: data + bytes(4)),
+        "values_too_long": changed(
+            "more bytes than there may be", "RDM114", lambda data: data.ljust(1281, b"\0")
+        ),
+        "values_width": spoiled("wider than it needs to be", "RDM523", width=3),
+        "values_width_none": spoiled("no width and several rows", "RDM523", width=0),
+        "values_rows_none": spoiled("no rows", "RDM523", rows=0),
+        "values_rows_many": spoiled("more rows than entries", "RDM523", rows=2**32 - 1),
+        "values_beyond": of(
+            "an index without a row",
+            "RDM524",
+            COLOURS._replace(index=[0, 1, 2, 3])._replace(rows=COLOURS.rows, record={"width": 2}),
+        ),
+        "values_order": of("rows out of order", "RDM525", COLOURS._replace(index=[0, 2, 1, 1])),
+        "values_first": of("not the first row first", "RDM525", COLOURS._replace(index=[1, 0, 1, 2])),
+        "values_unused": of("a row that nothing has", "RDM525", COLOURS._replace(index=[0, 1, 1, 0])),
+        "values_equal": of("a row twice", "RDM526", COLOURS._replace(rows=[(1, 2, 3), (0, 0, 0), (1, 2, 3)])),
+        "values_filler": of("an unused byte behind the rows", "RDM527", COLOURS._replace(filler=1)),
+        "values_tail": of("an unused bit behind the indices", "RDM527", COLOURS._replace(tail=1 << 23)),
+        "values_empty": wrong(
+            "an empty scene with values", "RDM117", Plan([]), payloads={"ATTR": lambda _: b"x"}
+        ),
+        "values_packed": wrong("a frame cut short", "RDM121", many, packed={"ATTR": lambda d: frame(d)[:-1]}),
+        "groups_beyond": of("a group without a material", "RDM528", GROUPS, materials=[RED]),
+        "groups_huge": of("a group of 2^31", "RDM528", GROUPS._replace(rows=[(1,), (2**31,)]), **two),
+        "groups_alone": of("groups and no materials", "RDM113", GROUPS),
+    }
+
+
+def _materials() -> dict[str, tuple[str, list[str], bytes]]:
+    def of(codes: str, materials: list | bytes) -> tuple[str, list[str], bytes]:
+        about = "materials that are not what they must be"
+        return wrong(about, codes, PAIR, attributes=[GROUPS], materials=materials)
+
+    texts = {
+        "object": b"{}",
+        "bytes": b'[{"name": "\xff", "base_color": [0, 0, 0, 0]}]',
+        "cut": b'[{"name": "a"',
+        "nan": b'[{"name": "", "base_color": [NaN, 0, 0, 0]}]',
+        "deep": b"[" * 33 + b"]" * 33,
+    }
+    arrays = {
+        "numbers": [1, 2],
+        "nameless": [RED, {"base_color": [0, 0, 0, 0]}],
+        "name": [{**RED, "name": 1}, RED],
+        "colourless": [{"name": "a"}, RED],
+        "short": [{**RED, "base_color": [0, 0, 0]}, RED],
+        "bright": [{**RED, "base_color": [0, 0, 0, 1.5]}, RED],
+        "negative": [{**RED, "base_color": [0, 0, -1, 1]}, RED],
+        "truth": [{**RED, "base_color": [0, 0, True, 1]}, RED],
+        "words": [{**RED, "base_color": ["0", 0, 0, 1]}, RED],
+        "group": [{**RED, "group": None}, RED],
+        "more": [{**RED, "roughness": 1}, RED],
+    }
+    made = {f"materials_{name}": of("RDM531", text) for name, text in texts.items()}
+    made |= {f"materials_{name}": of("RDM531", rows) for name, rows in arrays.items()}
+    many = Plan(PAIR.blocks, attributes=[GROUPS], materials=[RED, GLASS])
+    return made | {
+        "materials_long": wrong(
+            "materials of 2^22 + 1 bytes",
+            "RDM532",
+            many,
+            payloads={"MATL": lambda _: bytes(2**22 + 1)},
+            packed={"MATL": lambda data: frame(data[:100], kind=1)},
+        ),
+        "materials_alone": wrong("materials and no groups", "RDM117", PAIR, materials=[RED]),
+        "materials_without_groups": wrong(
+            "materials and other values", "RDM117", PAIR, attributes=[COLOURS], materials=[RED]
+        ),
+        "materials_empty": wrong("an empty scene with materials", "RDM117", Plan([]), materials=[RED]),
     }
 
 

@@ -20,12 +20,13 @@ from typing import NamedTuple
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
 MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
-ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "META")
+ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "ATTR", "MATL", "META")
 RECORD = {
     **dict.fromkeys(("triangle_count", "block_count", "node_count", "top_count", "run_count"), "I"),
     **{"source_face_count": "I", "flags": "B", "reserved": "B", "grid_exponent": "h", "reserved_2": "I"},
     **{"error_bound": "d", **dict.fromkeys(("low_x", "low_y", "low_z", "high_x", "high_y", "high_z"), "f")},
-    **{"cell_x": "h", "cell_y": "h", "cell_z": "h", "longest_run": "H", "reserved_3": "24s"},
+    **{"cell_x": "h", "cell_y": "h", "cell_z": "h", "longest_run": "H"},
+    **dict.fromkeys(("origin_x", "origin_y", "origin_z"), "d"),
 }
 ENTRY = {
     **{"kind": "4s", "flags": "H", "codec": "H", "offset": "Q", "stored_length": "Q", "raw_length": "Q"},
@@ -333,6 +334,57 @@ def scene_bounds(blocks: list[Block]) -> list[float]:
     return [min(c) + 0.0 for c in columns] + [max(c) + 0.0 for c in columns]
 
 
+# Attributes
+
+
+class Values(NamedTuple):
+    """An attribute: distinct rows, the row of each entry, and fields of its record that hold something else.
+
+    `index` is None where each entry has a row of its own; numbers of type 0 are bits of floats. `filler` are
+    the unused bits behind the rows, `tail` those behind the indices.
+    """
+
+    name: str
+    domain: int
+    type: int
+    rows: list[tuple[int, ...]]
+    index: list[int] | None = None
+    record: dict = {}  # noqa: RUF012
+    filler: int = 0
+    tail: int = 0
+
+
+ATTRIBUTE = {
+    **{"name": "4s", "domain": "B", "components": "B", "type": "B", "width": "B"},
+    **{"rows": "I", "reserved": "I"},
+}
+
+
+def encode_attributes(attributes: list[Values]) -> bytes:
+    """The bytes of ATTR."""
+    head, data = struct.pack("<2I", len(attributes), 0), b""
+    for one in attributes:
+        width = (
+            0 if one.index is None or len(one.rows) == len(one.index) else (len(one.rows) - 1).bit_length()
+        )
+        fields = {"name": one.name.encode("latin-1"), "domain": one.domain, "components": len(one.rows[0])}
+        fields |= {"type": one.type, "width": width, "rows": len(one.rows), "reserved": 0}
+        head += record(ATTRIBUTE, fields | one.record)
+        rows = b"".join(struct.pack(f"<{len(row)}{'IBHI'[one.type]}", *row) for row in one.rows)
+        rows += one.filler.to_bytes(-len(rows) % 4, "little")
+        width = one.record.get("width", width)
+        data += rows + stream([(i, width) for i in one.index or []], one.tail)
+    return head + data
+
+
+def decoded_attributes(attributes: list[Values]) -> dict:
+    """The domain and the values of each attribute, as a reader gives them."""
+    return {
+        one.name: [one.domain, [list(one.rows[i]) for i in one.index or range(len(one.rows))]]
+        for one in attributes
+    }
+
+
 # Files
 
 
@@ -347,6 +399,8 @@ class Plan:
         top: How many of them are over blocks; None for as many as plain ones have.
         runs: `(first, count)` for each run of each block; None for strips cut at the longest.
         remap: `(face, rotation)` of each triangle.
+        attributes: The attributes, if any.
+        materials: An array, or the bytes of MATL.
         metadata: An object, or the bytes of META.
         grid: The grid exponent.
         cells: The exponents of the cells of plain nodes.
@@ -368,6 +422,8 @@ class Plan:
     top: int | None = None
     runs: list[list[tuple[int, int]]] | None = None
     remap: list[tuple[int, int]] | None = None
+    attributes: list[Values] = field(default_factory=list)
+    materials: list | bytes | None = None
     metadata: dict | bytes | None = None
     grid: int | None = None
     cells: tuple[int, int, int] = (0, 0, 0)
@@ -462,11 +518,15 @@ def sections(plan: Plan) -> dict[str, bytes]:
         remap = struct.pack(f"<{len(plan.remap)}I", *[face for face, _ in plan.remap])
         packed = stream([(rotation, 2) for _, rotation in plan.remap])
         remap += packed[: -(-len(plan.remap) // 4)]
-    metadata = plan.metadata or b""
+    attributes = encode_attributes(plan.attributes) if plan.attributes else b""
+    materials, metadata = plan.materials or b"", plan.metadata or b""
+    if isinstance(materials, list):
+        materials = json.dumps(materials, ensure_ascii=False).encode()
     if isinstance(metadata, dict):
         metadata = json.dumps(metadata, ensure_ascii=False).encode()
     nodes = b"".join(encode_node(node) for node in plan.nodes or [])
-    made = (record(RECORD, scene_record(plan)), headers, data, nodes, runs, remap, metadata)
+    made = (record(RECORD, scene_record(plan)), headers, data, nodes, runs, remap)
+    made += (attributes, materials, metadata)
     return dict(zip(ORDER, made, strict=True))
 
 
@@ -489,14 +549,16 @@ def scene_record(plan: Plan) -> dict:
         **dict(zip(names, bounds, strict=True)),
         **dict(zip(("cell_x", "cell_y", "cell_z"), plan.cells, strict=True)),
         "longest_run": 8 if plan.stored else 0,
-        "reserved_3": bytes(24),
+        "origin_x": 0.0,
+        "origin_y": 0.0,
+        "origin_z": 0.0,
     } | plan.record
 
 
 def decoding(plan: Plan) -> dict:
     """What a reader makes of a valid plan: floats as the hexadecimal of their bits, x, y and z in a row.
 
-    Fields of the record that are not there are zero.
+    Fields of the record that are not there are zero; no attributes and no materials are left out.
     """
     first, faces, vertices = 0, [], []
     for block in plan.blocks:
@@ -509,7 +571,7 @@ def decoding(plan: Plan) -> dict:
     if isinstance(metadata, bytes):
         metadata = json.loads(metadata, parse_int=str, parse_float=str)
     return {
-        "record": {name: value for name, value in fields.items() if value and value != bytes(24)},
+        "record": {name: value for name, value in fields.items() if value},
         "blocks": [block.count for block in plan.blocks],
         "vertices": vertices,
         "faces": faces,
@@ -519,6 +581,8 @@ def decoding(plan: Plan) -> dict:
         "metadata": metadata,
         "passed_over": skipped,
         "packed": sorted(plan.packed),
+        **({"attributes": decoded_attributes(plan.attributes)} if plan.attributes else {}),
+        **({"materials": plan.materials} if plan.materials else {}),
     }
 
 

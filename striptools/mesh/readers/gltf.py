@@ -4,7 +4,7 @@ trimesh gets a tree that holds nothing but the buffers, views and accessors of t
 indices, each checked against the bytes that are there (Khronos glTF 2.0 specification, sections 3.6 and
 3.7.2). Left to itself it reads sparse and compressed accessors as zeros, drops the mesh of a node that also
 has a camera, keeps the winding of mirrored instances, and names instances at random, so that their order is
-not the file's.
+not the file's. What primitives carry beside is read in gltf_attributes.py.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import binascii
 import json
 import math
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -23,13 +24,21 @@ from urllib.parse import unquote
 import numpy as np
 
 from striptools.errors import LimitError, UnreadableMeshError
+from striptools.mesh.attributes import Attribute
 from striptools.mesh.mesh import MOST_FACES, first_face_out_of_range
+from striptools.mesh.readers.gltf_attributes import (
+    material_number,
+    notes_on_the_rest,
+    primitive_attributes,
+    turned,
+    with_materials,
+)
 from striptools.mesh.readers.parsed import EXPORT_AGAIN, Parsed, counted, file_size, flatten, strict_numbers
 
 DEEPEST_JSON = 64
 LONGEST_ARRAY = 2**31 - 1
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 INDEX_COMPONENTS = (5121, 5123, 5125)
 POINTS_AND_LINES = (0, 1, 2, 3)
 TRIANGLES, STRIP = 4, 5
@@ -46,12 +55,38 @@ class Document:
         blob: The binary chunk of a GLB file, if any.
         folder: Where the files named by it may lie; None where they cannot be looked for.
         notes: What was left out or decided, by and by.
+        left: How often which attributes of primitives were left out.
+        buffers: The bytes of the buffers read so far.
     """
 
     tree: dict[str, Any]
     blob: memoryview | None
     folder: Path | None
     notes: list[str] = field(default_factory=list)
+    left: Counter[str] = field(default_factory=Counter)
+    buffers: dict[int, memoryview] = field(default_factory=dict)
+
+    def buffer(self, index: int) -> memoryview:
+        """The bytes of a buffer, read once."""
+        if index not in self.buffers:
+            self.buffers[index] = _load_buffer(self, index)
+        return self.buffers[index]
+
+    def read_accessor(
+        self, index: object, user: str, shapes: tuple[str, ...], components: tuple[int, ...]
+    ) -> tuple[np.ndarray, bool]:
+        """The rows of an accessor of one of some shapes, and whether it is normalised."""
+        shape = self.row("accessors", index, user).get("type")
+        accessor = _checked_accessor(self, index, user, shape if shape in shapes else shapes[0], components)
+        dtype, view = np.dtype("<" + COMPONENTS[accessor["componentType"]]), accessor["view"]
+        rows = np.ndarray(
+            (accessor["count"], WIDTHS[accessor["type"]]),
+            dtype,
+            self.buffer(view["buffer"]),
+            view["byteOffset"] + accessor["byteOffset"],
+            (view["byteStride"], dtype.itemsize),
+        )
+        return rows, bool(accessor.get("normalized"))
 
     def table(self, name: str) -> list[dict[str, Any]]:
         """The array of objects of a name; empty where it is not there."""
@@ -147,6 +182,7 @@ def _load_primitives(document: Document) -> dict[int, list[Parsed]]:
     """The triangles of each mesh, in the order of its primitives."""
     accessors: list[dict[str, Any]] = []
     wanted: list[tuple[int, dict[str, Any]]] = []
+    sources: list[dict[str, Any]] = []
     skipped = 0
     for index, mesh in enumerate(document.table("meshes")):
         primitives = mesh.get("primitives")
@@ -157,9 +193,19 @@ def _load_primitives(document: Document) -> dict[int, list[Parsed]]:
                 skipped += 1
             else:
                 wanted.append((index, _checked_primitive(document, primitive, f"meshes[{index}]", accessors)))
+                sources.append(primitive)
     if skipped:
         document.notes.append(f"{counted(skipped, 'primitive', 'primitives')} of points or lines left out")
-    return _through_trimesh(document, accessors, wanted)
+    parts: dict[int, list[Parsed]] = {}
+    for mesh, source, (positions, faces) in zip(
+        [mesh for mesh, _ in wanted], sources, _through_trimesh(document, accessors, wanted), strict=True
+    ):
+        attributes = primitive_attributes(source, len(positions), document.read_accessor, document.left)
+        if document.tree.get("materials"):
+            numbers = np.full((len(faces), 1), material_number(source, document.tree), np.int32)
+            attributes = (*attributes, Attribute("group", "face", numbers))
+        parts.setdefault(mesh, []).append(Parsed(positions, faces, attributes=attributes))
+    return parts
 
 
 def _checked_primitive(
@@ -232,16 +278,14 @@ def _checked_accessor(
 
 def _through_trimesh(
     document: Document, accessors: list[dict[str, Any]], wanted: list[tuple[int, dict[str, Any]]]
-) -> dict[int, list[Parsed]]:
-    """Decode the accessors of all wanted primitives and check the indices."""
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The positions and faces of all wanted primitives, the indices checked."""
     from trimesh.exchange.gltf import load_gltf
 
     if not wanted:
-        return {}
+        return []
     used = {one["view"]["buffer"] for one in accessors}
-    files = {
-        str(index): _load_buffer(document, index) if index in used else b"" for index in range(max(used) + 1)
-    }
+    files = {str(index): document.buffer(index) if index in used else b"" for index in range(max(used) + 1)}
     tree = {
         "asset": {"version": "2.0"},
         "buffers": [{"uri": name} for name in files],
@@ -256,7 +300,7 @@ def _through_trimesh(
         loaded = load_gltf(BytesIO(json.dumps(tree).encode()), resolver=files, skip_materials=True)[
             "geometry"
         ]
-    parts: dict[int, list[Parsed]] = {}
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
     for k, (mesh, primitive) in enumerate(wanted):
         positions = _scaled(loaded[str(k)]["vertices"], accessors[primitive["attributes"]["POSITION"]])
         faces = loaded[str(k)]["faces"]
@@ -266,7 +310,7 @@ def _through_trimesh(
                 f"face {bad} of meshes[{mesh}] names vertices {faces[bad].tolist()}, of {len(positions)}",
                 remedy=EXPORT_AGAIN,
             )
-        parts.setdefault(mesh, []).append(Parsed(positions, faces))
+        parts.append((positions, faces))
     return parts
 
 
@@ -359,7 +403,9 @@ def _flatten_scene(document: Document) -> Parsed:
         document.notes.append(
             f"winding turned in {counted(mirrored, 'mirrored instance', 'mirrored instances')}"
         )
-    return Parsed(whole.positions, whole.faces, tuple(document.notes))
+    document.notes += [*whole.notes, *notes_on_the_rest(document.left, document.tree)]
+    whole = Parsed(whole.positions, whole.faces, tuple(document.notes), whole.attributes)
+    return with_materials(whole, document.tree)
 
 
 def _placed(part: Parsed, matrix: np.ndarray) -> Parsed:
@@ -372,7 +418,8 @@ def _placed(part: Parsed, matrix: np.ndarray) -> Parsed:
     with np.errstate(invalid="ignore", over="ignore"):
         positions = part.positions.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         mirrored = np.linalg.det(matrix[:3, :3]) < 0
-    return Parsed(positions, part.faces[:, [0, 2, 1]] if mirrored else part.faces)
+    faces = part.faces[:, [0, 2, 1]] if mirrored else part.faces
+    return Parsed(positions, faces, attributes=turned(part.attributes, matrix))
 
 
 def _find_instances(document: Document) -> list[tuple[int, np.ndarray]]:

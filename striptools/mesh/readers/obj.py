@@ -4,18 +4,20 @@ trimesh's reading of OBJ faces cannot be kept from working over what it reads: i
 the end of the file instead of from the line they stand on, takes index 0 for 1, regroups faces by material
 and object, and splits vertices by texture coordinate. So the faces' position indices are read here, and
 trimesh gets the vertex lines alone, each cut down to three numbers where their lengths differ (it would read
-them as one flat table).
+them as one flat table). What corners and groups carry is read in obj_corners.py.
 """
 
 from __future__ import annotations
 
 import re
 from io import BytesIO
+from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from striptools.errors import UnreadableMeshError
+from striptools.mesh.readers.obj_corners import read_colours, read_corner_values, read_groups
 from striptools.mesh.readers.parsed import (
     EXPORT_AGAIN,
     Parsed,
@@ -35,8 +37,12 @@ OTHER_LINE = re.compile(rb"^[ \t]*(l|p|curv|curv2|surf)[ \t]", re.MULTILINE)
 BROKEN_EXPONENT = re.compile(rb"[+-]e", re.IGNORECASE)
 
 
-def read_obj(file: IO[bytes]) -> Parsed:
+def read_obj(file: IO[bytes], folder: Path | None = None) -> Parsed:
     """Read an OBJ file: the faces of all objects and groups in file order; n-gons are cut into fans.
+
+    Args:
+        file: The open file.
+        folder: Where the material files that it names may lie; None where they cannot be looked for.
 
     Raises:
         UnreadableMeshError: Naming the vertex or face where something is no number or cannot be an index.
@@ -45,13 +51,19 @@ def read_obj(file: IO[bytes]) -> Parsed:
     if b"#" in text:
         text = re.sub(rb"#.*", b"", text)
     positions = _read_vertices(VERTEX_LINE.findall(text))
-    faces, notes = fan_out(*_read_corners(text, len(positions)))
+    lengths, corners = _read_corners(text, len(positions))
+    fans = fan_out(lengths)
+    faces, notes = corners[fans.corners], fans.notes
     others = len(OTHER_LINE.findall(text))
     if others:
         notes += (
             f"{counted(others, 'point, line or curve element', 'point, line or curve elements')} left out",
         )
-    return Parsed(narrow(positions), faces, notes)
+    attributes, more = read_corner_values(text, FACE_LINE, fans)
+    colours, odd = read_colours(VERTEX_LINE.findall(text))
+    groups, materials, last = read_groups(text, FACE_LINE, fans, folder)
+    attributes = (*attributes, *colours, *groups)
+    return Parsed(narrow(positions), faces, notes + more + odd + last, attributes, materials)
 
 
 def _read_vertices(lines: list[bytes]) -> np.ndarray:
@@ -66,6 +78,8 @@ def _read_vertices(lines: list[bytes]) -> np.ndarray:
     if len(lengths) > 1:
         lines = [b" ".join(line.split()[:3]) for line in lines]
     table = b"v " + b"\nv ".join(lines) + b"\n"
+    if not table.isascii():
+        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN)
     odd = BROKEN_EXPONENT.search(table)
     if odd:
         place = table.count(b"\n", 0, odd.start()) + 1

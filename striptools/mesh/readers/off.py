@@ -13,9 +13,12 @@ from typing import IO
 import numpy as np
 
 from striptools.errors import UnreadableMeshError
+from striptools.mesh.attributes import WIDTHS, Attribute, Name
 from striptools.mesh.readers.parsed import (
     EXPORT_AGAIN,
+    Fans,
     Parsed,
+    counted,
     decode_text,
     fan_out,
     narrow,
@@ -27,7 +30,7 @@ KEYWORD = re.compile(rb"(ST)?(CN?|NC?)?OFF\b", re.IGNORECASE)
 
 
 def read_off(file: IO[bytes]) -> Parsed:
-    """Read an ASCII OFF file (also with normals, colours or texture coordinates, which are passed over).
+    """Read an ASCII OFF file, also with normals, colours or texture coordinates.
 
     Raises:
         UnreadableMeshError: For whatever is wrong with it.
@@ -35,19 +38,74 @@ def read_off(file: IO[bytes]) -> Parsed:
     from trimesh.exchange.off import load_off
 
     lines = _content_lines(decode_text(file.read()))
-    vertex_count, face_count, body = _read_counts(lines)
+    kind, vertex_count, face_count, body = _read_counts(lines)
     vertices = body[:vertex_count]
     if any(len(line.split()) < 3 for line in vertices):
         raise UnreadableMeshError(
             "a vertex of the OFF file has fewer than 3 coordinates", remedy=EXPORT_AGAIN
         )
-    faces, notes = fan_out(*_read_polygons(body[vertex_count : vertex_count + face_count]))
+    polygons = [line.split() for line in body[vertex_count : vertex_count + face_count]]
+    lengths, corners = _read_polygons(polygons)
+    fans = fan_out(lengths)
+    faces = corners[fans.corners]
     _require_indices(faces, vertex_count)
     rows = "\n".join(f"3 {a} {b} {c}" for a, b, c in faces.tolist()).encode()
-    text = b"OFF\n%d %d 0\n" % (vertex_count, len(faces)) + b"\n".join(vertices) + b"\n" + rows
+    table = b"\n".join(vertices)
+    if not table.isascii():
+        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN)
+    text = b"OFF\n%d %d 0\n" % (vertex_count, len(faces)) + table + b"\n" + rows
     with strict_numbers():
         found = load_off(BytesIO(text))
-    return Parsed(narrow(found["vertices"]), found["faces"].reshape(-1, 3), notes)
+    attributes, notes = _read_attributes(kind, vertices, polygons, fans)
+    return Parsed(
+        narrow(found["vertices"]), found["faces"].reshape(-1, 3), fans.notes + notes, tuple(attributes)
+    )
+
+
+def _read_attributes(
+    kind: bytes, vertices: list[bytes], polygons: list[list[bytes]], fans: Fans
+) -> tuple[list[Attribute], tuple[str, ...]]:
+    """What the columns behind positions and indices say, by the letters before OFF (Geomview's order)."""
+    rows = [line.split()[3:] for line in vertices]
+    found, notes = [], ()
+    place = 3 if b"N" in kind else 0
+    end = len(rows[0]) - (2 if kind.startswith(b"ST") else 0) if rows else 0
+    columns: list[tuple[Name, bool, int, int]] = [
+        ("normal", place > 0, 0, place),
+        ("color", b"C" in kind, place, end),
+        ("texcoord", kind.startswith(b"ST"), end, end + 2),
+    ]
+    for name, there, begin, stop in columns:
+        values = _table([row[begin:stop] for row in rows], name) if there and stop >= begin else None
+        if values is not None:
+            found.append(Attribute(name, "vertex", values))
+        elif there:
+            notes += (f"the {name} of {counted(len(rows), 'vertex', 'vertices')} left out: not one for each",)
+    behind = [row[1 + int(row[0]) :] for row in polygons]
+    coloured = sum(bool(row) for row in behind)
+    colours = _table(behind, "color") if coloured == len(behind) and b"C" not in kind else None
+    if colours is not None:
+        found.append(Attribute("color", "face", colours[fans.polygons]))
+    elif coloured:
+        notes += (f"the colours of {counted(coloured, 'face', 'faces')} left out",)
+    return found, notes
+
+
+def _table(rows: list[list[bytes]], name: Name) -> np.ndarray | None:
+    """Equally long rows of numbers as values of an attribute, or None where they are not that."""
+    width = len(rows[0]) if rows else 0
+    if width not in WIDTHS[name] or any(len(row) != width for row in rows):
+        return None
+    try:
+        values = numbers(b" ".join(b" ".join(row) for row in rows)).reshape(len(rows), width)
+    except (UnreadableMeshError, ValueError):
+        return None
+    # Colours are whole numbers to 255 or fractions; a file that needs neither a point nor more is the first.
+    whole = name == "color" and not any(b"." in one or b"e" in one.lower() for row in rows for one in row)
+    if whole and not ((values >= 0) & (values <= 255)).all():
+        return None
+    with np.errstate(over="ignore"):
+        return values.astype(np.uint8 if whole else np.float32)
 
 
 def _content_lines(text: bytes) -> list[bytes]:
@@ -55,8 +113,8 @@ def _content_lines(text: bytes) -> list[bytes]:
     return [line for line in lines if line]
 
 
-def _read_counts(lines: list[bytes]) -> tuple[int, int, list[bytes]]:
-    """The numbers of vertices and faces, and the lines after them, of which there are enough."""
+def _read_counts(lines: list[bytes]) -> tuple[bytes, int, int, list[bytes]]:
+    """The letters before OFF, the numbers of vertices and faces, the lines after: there are enough."""
     keyword = KEYWORD.match(lines[0]) if lines else None
     if keyword is None:
         raise UnreadableMeshError("not an ASCII OFF file: it does not begin with OFF")
@@ -72,11 +130,10 @@ def _read_counts(lines: list[bytes]) -> tuple[int, int, list[bytes]]:
             f" but only {len(lines) - 1} lines follow",
             remedy="the file is cut short or its counts are wrong",
         )
-    return vertices, faces, lines[1:]
+    return keyword[0][:-3].upper(), vertices, faces, lines[1:]
 
 
-def _read_polygons(lines: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-    rows = [line.split() for line in lines]
+def _read_polygons(rows: list[list[bytes]]) -> tuple[np.ndarray, np.ndarray]:
     lengths = numbers(b" ".join(row[0] for row in rows), np.int64)
     for k, (row, length) in enumerate(zip(rows, lengths, strict=True)):
         if not 0 <= length < len(row):

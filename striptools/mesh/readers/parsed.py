@@ -12,6 +12,7 @@ from typing import IO
 import numpy as np
 
 from striptools.errors import LimitError, UnreadableMeshError
+from striptools.mesh.attributes import Attribute, Material, join_attributes, tidy_name
 from striptools.mesh.mesh import MOST_FACES
 
 EXPORT_AGAIN = "export the model again"
@@ -25,11 +26,32 @@ class Parsed:
         positions: `(v, 3)` floating point.
         faces: `(f, 3)` of any integer type, in file order.
         notes: What the reader had to do.
+        attributes: What else it found, of right shape and type.
+        materials: What the groups stand for.
+        unit: The length that 1 stands for, where the format or file says so.
     """
 
     positions: np.ndarray
     faces: np.ndarray
     notes: tuple[str, ...] = ()
+    attributes: tuple[Attribute, ...] = ()
+    materials: tuple[Material, ...] = ()
+    unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fans:
+    """Polygons cut into fans from their first corner.
+
+    Args:
+        corners: `(f, 3)` int64: which corner of all polygons' each corner of a triangle is.
+        polygons: `(f,)` int64: the polygon that each triangle is part of.
+        notes: How many polygons were cut, how many had fewer than 3 corners and are left out.
+    """
+
+    corners: np.ndarray
+    polygons: np.ndarray
+    notes: tuple[str, ...]
 
 
 def file_size(file: IO[bytes]) -> int:
@@ -44,23 +66,18 @@ def counted(number: int, one: str, many: str) -> str:
     return f"{number} {one if number == 1 else many}"
 
 
-def fan_out(lengths: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Cut polygons into fans from their first corner, in file order.
+def fan_out(lengths: np.ndarray) -> Fans:
+    """Cut polygons into fans, in file order.
 
     Args:
         lengths: `(p,)` corners of each polygon.
-        corners: `(sum of lengths,)` vertex indices, polygon by polygon.
-
-    Returns:
-        `(f, 3)` faces and notes: how many polygons were cut, how many had fewer than 3 corners and are left
-        out.
     """
     lengths = np.asarray(lengths, np.int64)
     triangles = np.maximum(lengths - 2, 0)
     polygon = np.repeat(np.arange(len(lengths)), triangles)
     first = (np.cumsum(lengths) - lengths)[polygon]
     step = np.arange(len(polygon)) - (np.cumsum(triangles) - triangles)[polygon]
-    faces = corners[np.stack([first, first + step + 1, first + step + 2], axis=1)]
+    corners = np.stack([first, first + step + 1, first + step + 2], axis=1)
     cut, short = int(np.count_nonzero(lengths > 3)), int(np.count_nonzero(lengths < 3))
     notes = []
     if cut:
@@ -68,11 +85,22 @@ def fan_out(lengths: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, tuple
         notes.append(f"{counted(cut, 'n-gon', 'n-gons')} cut into {made} triangles")
     if short:
         notes.append(f"{counted(short, 'face', 'faces')} of fewer than 3 corners left out")
-    return faces, tuple(notes)
+    return Fans(corners, polygon, tuple(notes))
+
+
+def left_out(what: Sequence[str], one: str, many: str, most: int = 5) -> tuple[str, ...]:
+    """`2 properties left out: weight, tag` as the one note; none where nothing was."""
+    if not what:
+        return ()
+    more = ", ..." if len(what) > most else ""
+    names = ", ".join(tidy_name(name)[:40] for name in what[:most])
+    return (f"{counted(len(what), one, many)} left out: {names}{more}",)
 
 
 def flatten(parts: Sequence[Parsed]) -> Parsed:
     """Put parts one after another into one mesh; positions stay float32 only where all parts are.
+
+    Attributes are joined; materials are not, and groups are left to the caller.
 
     Raises:
         LimitError: Where the whole would have too many triangles or vertices.
@@ -91,7 +119,11 @@ def flatten(parts: Sequence[Parsed]) -> Parsed:
     notes = tuple(note for part in parts for note in part.notes)
     if not parts:
         return Parsed(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), notes)
-    return Parsed(np.concatenate([part.positions for part in parts]), np.concatenate(faces), notes)
+    attributes, lacking = join_attributes(
+        [(len(part.positions), len(part.faces), part.attributes) for part in parts]
+    )
+    positions = np.concatenate([part.positions for part in parts])
+    return Parsed(positions, np.concatenate(faces), notes + lacking, attributes)
 
 
 def narrow(positions: np.ndarray) -> np.ndarray:
@@ -134,6 +166,7 @@ def strict_numbers() -> Iterator[None]:
             warnings.filterwarnings("error", message="invalid value encountered in cast")
             yield
     except (DeprecationWarning, RuntimeWarning, ValueError) as error:
-        if isinstance(error, ValueError) and "string or file could not be read" not in str(error):
+        known = ("string or file could not be read", "could not convert string to float")
+        if isinstance(error, ValueError) and not any(words in str(error) for words in known):
             raise
         raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN) from error

@@ -4,13 +4,16 @@ The header is read here and checked against the size of the file before anything
 whose lists all have one length, the ordinary case, goes through trimesh. trimesh refuses lists of several
 lengths in a binary file, trusts the first list's length for all others, splits vertices by texture coordinate
 and turns the order of mixed polygons about; so what its fast path does not read faithfully, and all ASCII
-files, are walked row by row (kernels/rows.py). A test holds the two ways equal.
+files, are walked row by row (kernels/rows.py). A test holds the two ways equal. What other columns say is
+decided in ply_columns.py.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import IO
 
 import numpy as np
@@ -18,12 +21,22 @@ import numpy as np
 from striptools.errors import UnreadableMeshError
 from striptools.mesh.readers.parsed import (
     EXPORT_AGAIN,
+    Fans,
     Parsed,
     counted,
     fan_out,
     file_size,
+    left_out,
     numbers,
     strict_numbers,
+)
+from striptools.mesh.readers.ply_columns import (
+    WEDGES,
+    Columns,
+    Read,
+    columns_note,
+    face_attributes,
+    vertex_attributes,
 )
 
 LONGEST_HEADER = 1 << 20
@@ -70,14 +83,23 @@ class Element:
         """The number of the first property with one of the names, or -1."""
         return next((k for k, column in enumerate(self.properties) if column.name in names), -1)
 
+    def others(self, *names: str) -> Columns:
+        """The columns of other names, with their types; None for lists."""
+        found: Columns = {}
+        for one in self.properties:
+            if one.name not in names:
+                found.setdefault(one.name, None if one.count else one.dtype)
+        return found
+
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a PLY file: byte order ("" for ASCII), its tables, and where their rows begin."""
+    """The header of a PLY file: byte order ("" for ASCII), its tables, where their rows begin, textures."""
 
     order: str
     elements: tuple[Element, ...]
     end: int
+    textures: tuple[str, ...] = ()
 
     def element(self, name: str) -> Element:
         """The element of a name; an empty one where there is none."""
@@ -85,7 +107,9 @@ class Header:
 
 
 def read_ply(file: IO[bytes]) -> Parsed:
-    """Read a PLY file: the vertices' x, y, z and the faces' vertex indices; n-gons are cut into fans.
+    """Read a PLY file: the vertices' x, y, z, the faces' vertex indices, and what else is known of them.
+
+    N-gons are cut into fans.
 
     Raises:
         UnreadableMeshError: For whatever is wrong with it.
@@ -114,6 +138,7 @@ def parse_header(text: bytes) -> Header:
         raise UnreadableMeshError("the PLY header never ends", remedy=EXPORT_AGAIN)
     order = None
     elements: list[tuple[str, int, list[Property]]] = []
+    textures = []
     for line in text[: closing.start()].decode("latin-1").splitlines()[1:]:
         words = line.split()
         if words[:1] == ["format"]:
@@ -126,10 +151,12 @@ def parse_header(text: bytes) -> Header:
                     "a property before any element in the PLY header", remedy=EXPORT_AGAIN
                 )
             elements[-1][2].append(_parse_property(line, words, order or "<"))
+        elif words[:2] == ["comment", "TextureFile"]:
+            textures.append(" ".join(words[2:]))
     if order is None:
         raise UnreadableMeshError("the PLY header names no known format", remedy=EXPORT_AGAIN)
     tables = tuple(Element(name, rows, tuple(columns)) for name, rows, columns in elements)
-    return Header(order, tables, closing.end())
+    return Header(order, tables, closing.end(), tuple(textures))
 
 
 def check_sizes(header: Header, size: int) -> None:
@@ -156,19 +183,49 @@ def walk_tables(data: bytes, header: Header) -> Parsed:
     """Read the tables behind a header row by row, whatever the lengths of their lists."""
     stream = np.frombuffer(data, np.uint8) if header.order else numbers(data)
     positions, polygons = np.zeros((0, 3), np.float32), (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    vertices = faces = None
     place = 0
     for element in header.elements:
         if element.name == "vertex":
             positions = _read_positions(stream, place, element, header)
+            vertices = element, partial(_plain_column, stream, place, element, header)
         target = element.find(*INDEX_NAMES) if element.name == "face" else -1
-        starts, lengths, place = _walk(stream, place, element, header, target)
+        starts, lengths, after = _walk(stream, place, element, header, target)
         if target >= 0:
             polygons = lengths, _gather(stream, starts, lengths, element.properties[target], header)
-    faces, notes = fan_out(*polygons)
+            faces = element, partial(_entries, stream, place, element, header)
+        place = after
+    fans = fan_out(polygons[0])
+    notes = fans.notes
     if place < len(stream):
         what = "byte" if header.order else "number"
         notes += (f"{counted(len(stream) - place, what, what + 's')} after the last element ignored",)
-    return Parsed(positions, faces, notes)
+    parsed = Parsed(positions, polygons[1][fans.corners], notes)
+    if vertices is None or faces is None:
+        return parsed
+    wedges = partial(_pairs, faces[1], polygons[0])
+    return _with_attributes(parsed, vertices, (faces[0], partial(_singles, faces[1])), wedges, fans, header)
+
+
+def _with_attributes(
+    parsed: Parsed,
+    vertices: tuple[Element, Read],
+    faces: tuple[Element, Read],
+    wedges: Callable[[str], np.ndarray | None],
+    fans: Fans | Callable[[], Fans],
+    header: Header,
+) -> Parsed:
+    """The mesh with what its other columns say; the same mesh where it has no others."""
+    own, others = vertices[0].others("x", "y", "z"), faces[0].others(*INDEX_NAMES)
+    if not own and not others and not header.textures:
+        return parsed
+    attributes, names = vertex_attributes(own, vertices[1])
+    if others:
+        fans = fans if isinstance(fans, Fans) else fans()
+        more, left = face_attributes(others, faces[1], wedges, fans, {one.name for one in attributes})
+        attributes, names = attributes + more, names + left
+    notes = parsed.notes + columns_note(names) + left_out(header.textures, "texture", "textures")
+    return Parsed(parsed.positions, parsed.faces, notes, tuple(attributes))
 
 
 def _parse_element(line: str, words: list[str]) -> tuple[str, int, list[Property]]:
@@ -212,7 +269,29 @@ def _through_trimesh(file: IO[bytes], header: Header) -> Parsed | None:
         or (rows["f0"] != 3).any()
     ):
         return None
-    return Parsed(_stack_axes([vertices[axis] for axis in "xyz"]), rows["f1"])
+    parsed = Parsed(_stack_axes([vertices[axis] for axis in "xyz"]), rows["f1"])
+    return _with_columns(parsed, vertices, raw["face"]["data"], header)
+
+
+def _with_columns(parsed: Parsed, vertices: np.ndarray, faces: np.ndarray, header: Header) -> Parsed | None:
+    """The mesh of triangles with what its other columns say, or None where their lists have other lengths."""
+    element = header.element("face")
+
+    def wedges(name: str) -> np.ndarray | None:
+        return faces[name]["f1"].reshape(-1, 2)
+
+    for name in WEDGES:
+        pairs = faces[name] if element.others().get(name, 0) is None else None
+        if pairs is not None and (pairs["f1"].shape[1:] != (6,) or (pairs["f0"] != 6).any()):
+            return None
+    return _with_attributes(
+        parsed,
+        (header.element("vertex"), lambda name: vertices[name]),
+        (element, lambda name: faces[name]),
+        wedges,
+        lambda: fan_out(np.full(element.rows, 3)),
+        header,
+    )
 
 
 def _stack_axes(axes: list[np.ndarray]) -> np.ndarray:
@@ -228,16 +307,62 @@ def _read_positions(stream: np.ndarray, place: int, element: Element, header: He
     columns = [element.find(axis) for axis in "xyz"]
     if min(columns) < 0 or element.has_list:
         raise UnreadableMeshError("the PLY vertices have no plain x, y and z", remedy=EXPORT_AGAIN)
-    if not header.order:
-        table = stream[place : place + element.rows * len(element.properties)]
-        if len(table) < element.rows * len(element.properties):
-            raise UnreadableMeshError("the PLY file ends among its vertices", remedy="the file is cut short")
-        table = table.reshape(element.rows, -1)
-        with np.errstate(over="ignore"):
-            return _stack_axes([table[:, k].astype(element.properties[k].dtype) for k in columns])
-    row = np.dtype([(f"column{k}", one.dtype) for k, one in enumerate(element.properties)])
-    table = np.frombuffer(stream, row, element.rows, place)
-    return _stack_axes([table[f"column{k}"] for k in columns])
+    table = _plain_table(stream, place, element, header)
+    if header.order:
+        return _stack_axes([table[f"column{k}"] for k in columns])
+    with np.errstate(over="ignore"):
+        return _stack_axes([table[:, k].astype(element.properties[k].dtype) for k in columns])
+
+
+def _plain_table(stream: np.ndarray, place: int, element: Element, header: Header) -> np.ndarray:
+    """The rows of an element without lists: of named columns, or of numbers in an ASCII file."""
+    if header.order:
+        row = np.dtype([(f"column{k}", one.dtype) for k, one in enumerate(element.properties)])
+        return np.frombuffer(stream, row, element.rows, place)
+    table = stream[place : place + element.rows * len(element.properties)]
+    if len(table) < element.rows * len(element.properties):
+        raise UnreadableMeshError("the PLY file ends among its vertices", remedy="the file is cut short")
+    return table.reshape(element.rows, -1)
+
+
+def _plain_column(
+    stream: np.ndarray, place: int, element: Element, header: Header, name: str
+) -> np.ndarray | None:
+    """A column of an element without lists, in its own type; None where it does not fit that."""
+    table, k = _plain_table(stream, place, element, header), element.find(name)
+    return table[f"column{k}"] if header.order else _fitted(table[:, k], element.properties[k].dtype)
+
+
+def _entries(
+    stream: np.ndarray, place: int, element: Element, header: Header, name: str
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """How many entries a column has in each row, and all of them; None where one does not fit its type."""
+    k = element.find(name)
+    starts, lengths, _ = _walk(stream, place, element, header, k)
+    found = _gather_entries(stream, starts, lengths, element.properties[k], header)
+    return lengths, found if header.order else _fitted(found, element.properties[k].dtype)
+
+
+def _singles(entries: Callable[[str], tuple[np.ndarray, np.ndarray | None]], name: str) -> np.ndarray | None:
+    return entries(name)[1]
+
+
+def _pairs(
+    entries: Callable[[str], tuple[np.ndarray, np.ndarray | None]], lengths: np.ndarray, name: str
+) -> np.ndarray | None:
+    """The pairs of a list column, where there is one a corner."""
+    found, values = entries(name)
+    return None if values is None or (found != 2 * lengths).any() else values.reshape(-1, 2)
+
+
+def _fitted(values: np.ndarray, dtype: np.dtype) -> np.ndarray | None:
+    """Numbers of text as the type that the header gives them."""
+    if dtype.kind != "f":
+        least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
+        if not ((values >= least) & (values <= most)).all():
+            return None
+    with np.errstate(over="ignore"):
+        return values.astype(dtype)
 
 
 def _walk(
@@ -274,14 +399,18 @@ def _walk(
 def _gather(
     stream: np.ndarray, starts: np.ndarray, lengths: np.ndarray, column: Property, header: Header
 ) -> np.ndarray:
-    """The entries of all target lists, one after another."""
-    from striptools.kernels.rows import gather_runs
-
-    if header.order:
-        width = column.dtype.itemsize
-        found = gather_runs(stream, starts, lengths * width).view(column.dtype)
-    else:
-        found = gather_runs(stream, starts, lengths)
+    """The entries of all target lists, one after another, as indices."""
+    found = _gather_entries(stream, starts, lengths, column, header)
     if found.dtype.kind == "f" and not ((np.abs(found) < 2**53) & (found == np.floor(found))).all():
         raise UnreadableMeshError("a PLY vertex index is no number that an index can be", remedy=EXPORT_AGAIN)
     return found.astype(np.int64)
+
+
+def _gather_entries(
+    stream: np.ndarray, starts: np.ndarray, lengths: np.ndarray, column: Property, header: Header
+) -> np.ndarray:
+    from striptools.kernels.rows import gather_runs
+
+    if header.order:
+        return gather_runs(stream, starts, lengths * column.dtype.itemsize).view(column.dtype)
+    return gather_runs(stream, starts, lengths)

@@ -66,6 +66,11 @@ def _read_binary(file: IO[bytes], needed: int, spare: int) -> Parsed:
     with strict_numbers():
         found = load_stl(BytesIO(file.read(needed)) if spare else file)
     notes = (f"{counted(spare, 'byte', 'bytes')} after the last triangle ignored",) if spare else ()
+    file.seek(0)
+    words = np.frombuffer(file.read(needed), np.uint8)[HEADER:].reshape(-1, FACET)[:, -2:]
+    used = int(np.count_nonzero(words.any(axis=1)))
+    if used:
+        notes += (f"the attribute bytes of {counted(used, 'facet', 'facets')} left out",)
     if "vertices" not in found:
         return Parsed(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), notes)
     return Parsed(found["vertices"], found["faces"], notes)
