@@ -16,7 +16,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 from striptools.trace.launch import _collect, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
-from striptools.trace.walk_wide import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
+from striptools.trace.walk import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
 
 LOWEST = np.finfo(np.float32).min
 
