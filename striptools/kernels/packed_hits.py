@@ -5,7 +5,7 @@ from math import ldexp
 import numpy as np
 from numba import njit
 
-from striptools.kernels.blocks import axis_of, block_counts, take
+from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_corners
 
@@ -42,6 +42,84 @@ def depth_of(words, records, top_count):
                 level[block] = below
                 block += 1
     return depth
+
+
+@njit(cache=True, nogil=True)
+def least_exponent(headers, words):
+    """The exponent of the least power of two that is in a coordinate of mode 2; 0 where all are larger."""
+    least = np.int64(0)
+    for block in range(len(headers)):
+        connectivity, size = block_bits(headers, block)
+        _, vertices, _, _, _ = block_counts(headers, block)
+        stride = size // vertices
+        bit = (np.int64(headers[block, 1]) << 5) + connectivity
+        for axis in range(3):
+            mode, width, anchor, _ = axis_of(headers, block, axis)
+            if mode == 2:
+                for k in range(vertices):
+                    whole = take(words, bit + k * stride, width) + anchor
+                    bits = whole if whole >= 0 else -1 - whole
+                    if bits > 0:
+                        least = min(least, (bits >> 23) - 127 if bits >= 0x800000 else np.int64(-149))
+            bit += width
+    return least
+
+
+@njit(cache=True, nogil=True)
+def describe_runs(headers, words, first_run, runs, begin, end, described):
+    """Say of each run of the blocks `begin:end` all that its triangles' places are found by.
+
+    In the order of a strip's vertices, newest behind, triangle j of a run whose first vertex is number p has
+    vertex p + j + 2 for its newest corner and p + j + 1 for its near one; by its turn the near one is a or b.
+    The far one is p + u + 1, u the last triangle of the run up to j of another turn, or what it was for the
+    run's first triangle where there is none. A strip's first triangle is like one of turn 1.
+
+    Args:
+        headers: (b, 8) uint32.
+        words: (w,) uint32.
+        first_run: (b+1,) int64.
+        runs: (r,) uint16.
+        begin: The first block.
+        end: Where they end.
+        described: (r,) uint32, written. Bits 0 to 7: the first triangle; 8 to 10: triangles, less one; 11 to
+            18: the strip, counted in the block; 19 to 26: turns; 27 to 31: p + 1 - k is the far corner's place
+            for the first triangle, this is k.
+    """
+    strip_of = np.empty(256, np.int64)
+    start_of = np.empty(256, np.int64)
+    turn_of = np.empty(256, np.int64)
+    last_of = np.empty(256, np.int64)
+    for block in range(begin, end):
+        # Follow the strips: of each triangle its strip, its turn, and the last other turn.
+        count = block_counts(headers, block)[0]
+        bit = np.int64(headers[block, 1]) << 5
+        strip = np.int64(-1)
+        start = np.int64(0)
+        for t in range(count):
+            turn = take(words, bit + count + t, 1)
+            if take(words, bit + t, 1):
+                strip += 1
+                start = t
+                turn = np.int64(1)
+                last_of[t] = -1
+            elif turn != turn_of[t - 1]:
+                last_of[t] = t - 1
+            else:
+                last_of[t] = last_of[t - 1]
+            strip_of[t] = strip
+            start_of[t] = start
+            turn_of[t] = turn
+
+        # Write the runs.
+        for run in range(first_run[block], first_run[block + 1]):
+            first = np.int64(runs[run]) & 255
+            length = np.int64(runs[run]) >> 8 & 7
+            turns = np.int64(0)
+            for j in range(length + 1):
+                turns |= turn_of[first + j] << j
+            last = last_of[first]
+            back = first - last if last >= 0 else first - start_of[first] + turn_of[first]
+            described[run] = first | length << 8 | strip_of[first] << 11 | turns << 19 | back << 27
 
 
 @njit(cache=True, nogil=True)
@@ -125,10 +203,10 @@ def weigh_packed_hits(
     directions,
     at,
     found_t,
-    found_face,
-    found_triangle,
+    found,
     headers,
     words,
+    faces,
     rotations,
     scale,
     scale_exponent,
@@ -145,10 +223,10 @@ def weigh_packed_hits(
         directions: (r, 3) float32, not zero where there is a hit.
         at: (k,) int32, the rays that results are for; others are left alone.
         found_t: (k,) float32, t of each.
-        found_face: (k,) int32, the reported face; negative on a miss.
-        found_triangle: (k,) int32, the triangle in file order.
+        found: (k,) int32, the triangle in file order; negative on a miss.
         headers: (b, 8) uint32.
         words: (w,) uint32.
+        faces: (>= n,) int32, the reported face of each triangle; (0,) where triangles are faces.
         rotations: (n,) uint8, places that the reported face's corners were turned to the left; or (0,).
         scale: float32, what positions are multiplied by.
         scale_exponent: Its exponent.
@@ -164,15 +242,17 @@ def weigh_packed_hits(
     for k in range(len(at)):
         r = at[k]
         t[r] = found_t[k]
-        face[r] = found_face[k]
-        if face[r] < 0:
+        face[r] = found[k]
+        triangle[r] = found[k]
+        if found[k] < 0:
             u[r] = 0.0
             v[r] = 0.0
             triangle[r] = -1
             continue
+        if len(faces) > 0:
+            face[r] = faces[found[k]]
 
         # Decode the triangle, and turn it as the tests do.
-        triangle[r] = found_triangle[k]
         block = block_of(headers, triangle[r])
         indices = corner_indices(headers, words, block, np.int64(triangle[r]) - np.int64(headers[block, 0]))
         for j in range(3):
