@@ -1,7 +1,5 @@
 """Kernels of the tracer of packed blocks: what it keeps of the nodes, and where on its face a hit lies."""
 
-from math import ldexp
-
 import numpy as np
 from numba import njit
 
@@ -136,6 +134,15 @@ def block_of(headers, triangle):
     return low
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def bits_set(number):
+    """How many bits of a number below 2**32 are set."""
+    number -= number >> 1 & 0x55555555
+    number = (number & 0x33333333) + (number >> 2 & 0x33333333)
+    number = (number + (number >> 4)) & 0x0F0F0F0F
+    return number * 0x01010101 >> 24 & 0xFF
+
+
 @njit(cache=True, nogil=True)
 def corner_indices(headers, words, block, t):
     """The indices of triangle t of a block: SPEC 4.3, alone."""
@@ -144,11 +151,11 @@ def corner_indices(headers, words, block, t):
 
     # Find the strip.
     strip = np.int64(-1)
-    first = np.int64(0)
-    for k in range(t + 1):
-        if take(words, bit + k, 1):
-            strip += 1
-            first = k
+    for k in range(0, t + 1, 32):
+        strip += bits_set(take(words, bit + k, min(t + 1 - k, 32)))
+    first = t
+    while take(words, bit + first, 1) == 0:
+        first -= 1
 
     # Find the last other turn.
     turn = take(words, bit + count + t, 1)
@@ -169,32 +176,40 @@ def corner_indices(headers, words, block, t):
     return a, b, c
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def power_of_two(exponent):
+    """2**exponent as float64, exponent from -1022 to 1023."""
+    return np.int64((exponent + 1023) << 52).view(np.float64)
+
+
 @njit(cache=True, nogil=True)
-def scaled_vertex(headers, words, block, vertex, scale_exponent, corner):
-    """Fill corner (3,) float32 with a block's vertex times 2**scale_exponent; zero for denormals."""
+def scaled_corners(headers, words, block, indices, scale_exponent, corners):
+    """Fill corners (3, 3) float32, a row each, with three of a block's vertices times 2**scale_exponent.
+
+    What is not a normal number then is zero, as the walks have it.
+    """
     count, _, strips, has_flips, index_width = block_counts(headers, block)
-    bit = (np.int64(headers[block, 1]) << 5) + (2 + has_flips) * count + (count + 2 * strips) * index_width
-    stride = np.int64(0)
-    for axis in range(3):
-        stride += axis_of(headers, block, axis)[1]
-    bit += vertex * stride
+    begin = (np.int64(headers[block, 1]) << 5) + (2 + has_flips) * count + (count + 2 * strips) * index_width
+    stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
     for axis in range(3):
         mode, width, anchor, exponent = axis_of(headers, block, axis)
-        number = take(words, bit, width)
-        bit += width
-        whole = number + anchor
-        size = abs(whole)
-        if mode == 2:
-            # Take the bits of the float apart.
-            bits = whole if whole >= 0 else -1 - whole
-            field = bits >> 23
-            size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
-            exponent = max(field, 1) - 150
-        elif mode == 1 and number == (1 << width) - 1:
-            size = np.int64(0)
-        exact = np.float64(size) * ldexp(1.0, exponent + scale_exponent)
-        value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
-        corner[axis] = -value if whole < 0 else value
+        unit = power_of_two(exponent + scale_exponent)
+        for j in range(3):
+            number = take(words, begin + indices[j] * stride, width)
+            whole = number + anchor
+            size = abs(whole)
+            if mode == 2:
+                # Take the bits of the float apart.
+                bits = whole if whole >= 0 else -1 - whole
+                field = bits >> 23
+                size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
+                unit = power_of_two(max(field, 1) - 150 + scale_exponent)
+            elif mode == 1 and number == (1 << width) - 1:
+                size = np.int64(0)
+            exact = np.float64(size) * unit
+            value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
+            corners[j, axis] = -value if whole < 0 else value
+        begin += width
 
 
 @njit(cache=True, nogil=True)
@@ -255,8 +270,7 @@ def weigh_packed_hits(
         # Decode the triangle, and turn it as the tests do.
         block = block_of(headers, triangle[r])
         indices = corner_indices(headers, words, block, np.int64(triangle[r]) - np.int64(headers[block, 0]))
-        for j in range(3):
-            scaled_vertex(headers, words, block, indices[j], scale_exponent, decoded[j])
+        scaled_corners(headers, words, block, indices, scale_exponent, decoded)
         turn = first_corner(decoded)
         for j in range(3):
             for axis in range(3):
