@@ -220,9 +220,9 @@ def _contents(inspection: Inspection) -> bool:
     """Look into the sections, each where it and what it leans on are whole."""
     sections = inspection.sections
     _record(inspection, sections["SCEN"])
-    if "BLKH" in sections and "BLKD" in sections:
-        geometry = inspect_blocks(inspection)
-        if geometry is not None and "NODE" in sections:
+    if "BLKH" in sections:
+        geometry = inspect_blocks(inspection) if "BLKD" in sections else None
+        if "NODE" in sections:
             inspect_nodes(inspection, geometry)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])
@@ -310,8 +310,8 @@ def _metadata(inspection: Inspection, section: Section) -> None:
     if _levels(text) > _MOST_LEVELS:
         return inspection.found("RDM904", "META", section.offset)
     try:
-        # Numbers stay text: Python refuses more than 4,300 digits, JSON does not.
-        metadata = json.loads(text, parse_int=str, parse_float=str, parse_constant=_no_number)
+        # Every number is 0 here: Python refuses more than 4,300 digits, JSON does not.
+        metadata = json.loads(text, parse_int=lambda _: 0, parse_constant=_no_number)
     except json.JSONDecodeError as error:
         return inspection.found("RDM901", "META", section.at(len(text[: error.pos].encode())))
     except ValueError:

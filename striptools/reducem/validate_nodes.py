@@ -25,17 +25,21 @@ _NODE = np.dtype(
 
 @dataclass(frozen=True)
 class _Runs:
-    """The runs: the number of each block's first, and for each its block, first triangle and length."""
+    """The runs: the number of each block's first, and for each its block, first triangle and length.
+
+    `whole` says whether they have each triangle once.
+    """
 
     starts: np.ndarray
     block: np.ndarray
     first: np.ndarray
     count: np.ndarray
+    whole: bool
 
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The nodes, and of each slot, (m, 8), whether it is inner or a leaf, and which one it names."""
+    """The nodes, and for each slot, (m, 8), whether it is inner, a leaf or a sound box, and what it names."""
 
     section: Section
     rows: np.ndarray
@@ -43,6 +47,7 @@ class _Nodes:
     blocks: int
     is_inner: np.ndarray
     is_leaf: np.ndarray
+    is_box: np.ndarray
     child: np.ndarray
     leaf: np.ndarray
 
@@ -51,29 +56,30 @@ class _Nodes:
         return np.arange(len(self.rows)) < self.top
 
 
-def inspect_nodes(inspection: Inspection, geometry: Geometry) -> None:
-    """Look at the runs, where boxes are stored, and at the nodes."""
+def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
+    """Look at runs, where boxes are stored, and at nodes; without sound blocks, at what nodes name."""
     record = inspection.sections["SCEN"].data
     blocks, count, top, run_count = (int(x) for x in np.frombuffer(record, "<u4", 4, 4))
     stored = record[24] & 1
-    whole = "RUNS" in inspection.sections and count >= top + blocks if stored else count == top
-    if not whole:
+    if not (count >= top + blocks if stored else count == top):
         return
-    longest = int.from_bytes(record[70:72], "little")
-    runs = _runs(inspection, geometry, run_count, longest) if stored else None
-    if stored and runs is None:
-        return
+    runs = None
+    if stored and geometry is not None and "RUNS" in inspection.sections:
+        longest = int.from_bytes(record[70:72], "little")
+        runs = _runs(inspection, geometry, run_count, longest)
     nodes = _slots(inspection, top, blocks)
     parents = _parents(inspection, nodes)
     sound = _blocks(inspection, nodes)
     if runs is not None and parents is not None:
         sound = _leaves(inspection, nodes, parents, runs) and sound
-    if sound and parents is not None:
+    whole = not stored or (runs is not None and runs.whole)
+    sound = sound and whole and parents is not None
+    if geometry is not None and sound and (nodes.is_inner | nodes.is_leaf).any(axis=1).all():
         _boxes(inspection, nodes, geometry, runs)
 
 
 def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) -> _Runs | None:
-    """Look at the runs; gives them where each is inside its block."""
+    """Look at the runs; gives them where those of each block follow those of the one before."""
     section = inspection.sections["RUNS"]
     b = len(geometry.starts) - 1
     starts = np.append(np.frombuffer(section.data, "<u4", b).astype(np.int64), count)
@@ -102,13 +108,13 @@ def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) 
     over = begun[last] != begun[np.minimum(first, len(begun) - 1)]
     check("RDM802", outside | over | (length > longest))
     if outside.any():
-        return None
+        return _Runs(starts, block, first, length, whole=False)
     triangles = np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
     times = np.bincount(triangles, minlength=len(begun))
     wrong = inspection.found_where(
         "RDM803", times != 1, lambda t: f"RUNS: triangle {t}", lambda t: section.at(4 * b)
     )
-    return None if wrong else _Runs(starts, block, first, length)
+    return _Runs(starts, block, first, length, whole=not wrong)
 
 
 def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
@@ -131,7 +137,7 @@ def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
     child = base[:, None] + np.cumsum(is_inner, axis=1) - 1
     first = np.where(np.arange(len(rows)) < top, leaves, leaves >> 24)
     leaf = first[:, None] + np.cumsum(is_leaf, axis=1) - 1
-    return _Nodes(section, rows, top, blocks, is_inner, is_leaf, child, leaf)
+    return _Nodes(section, rows, top, blocks, is_inner, is_leaf, ~is_empty & ~inverted, child, leaf)
 
 
 def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
@@ -143,7 +149,7 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
     outside = nodes.is_inner & ((nodes.child < least) | (nodes.child >= most))
     at = nodes.section.at
     wrong = inspection.found_where(
-        "RDM701", outside.any(axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
+        "RDM701", np.any(outside, axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
     )
     parent, slot = np.nonzero(nodes.is_inner & ~outside)
     child = nodes.child[parent, slot]
@@ -212,8 +218,7 @@ def _boxes(inspection: Inspection, nodes: _Nodes, geometry: Geometry, runs: _Run
         return
     low, high = _content(nodes, geometry, runs)
     shift = np.stack([nodes.rows["base"] >> 28, nodes.rows["shifts"] & 15, nodes.rows["shifts"] >> 4], axis=1)
-    taken = nodes.is_inner | nodes.is_leaf
-    leaking = np.zeros(taken.shape, np.bool_)
+    leaking = np.zeros(nodes.is_box.shape, np.bool_)
     for axis in range(3):
         origin, scale = nodes.rows["origin"][:, axis].astype(np.int64), shift[:, axis].astype(np.int64)
         planes = (
@@ -227,7 +232,7 @@ def _boxes(inspection: Inspection, nodes: _Nodes, geometry: Geometry, runs: _Run
         leaking |= (below < 0) | (above > 0)
     inspection.found_where(
         "RDM707",
-        (leaking & taken).ravel(),
+        (leaking & nodes.is_box).ravel(),
         lambda i: f"NODE: node {i // 8}, slot {i % 8}",
         lambda i: nodes.section.at(64 * (i // 8) + 16 + i % 8),
     )

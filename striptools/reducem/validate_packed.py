@@ -20,7 +20,7 @@ def unpack(stored: bytes, raw_length: int) -> tuple[str, bytes]:
     Returns:
         The code of an issue, or an empty one, and the decoded bytes.
     """
-    if not _frame_is_allowed(stored, raw_length):
+    if not _frame_is_allowed(stored, raw_length) or not _frame_is_whole(stored):
         return "RDM121", b""
     decode = _decoder()
     if decode is None:
@@ -55,28 +55,25 @@ def _frame_is_allowed(stored: bytes, raw_length: int) -> bool:
     return len(field) == size and length == raw_length and not (single and length > _LARGEST_WINDOW)
 
 
+def _frame_is_whole(stored: bytes) -> bool:
+    """Whether the blocks of the frame, and its checksum where it has one, end where the stored bytes do."""
+    descriptor = stored[4]
+    single = descriptor >> 5 & 1
+    at = 6 - single + (single, 2, 4, 8)[descriptor >> 6]
+    last = False
+    while not last and at + 3 <= len(stored):
+        header = int.from_bytes(stored[at : at + 3], "little")
+        last, kind, size = bool(header & 1), header >> 1 & 3, header >> 3
+        at += 3 + (1 if kind == 1 else size)
+    return last and at + 4 * (descriptor >> 2 & 1) == len(stored)
+
+
 def _decoder() -> Callable[[bytes, int], bytes] | None:
-    """A function from stored bytes and a length to decoded bytes, of whichever library is here."""
-    for name in ("compression.zstd", "backports.zstd"):
-        try:
-            library = import_module(name)
-        except ImportError:
-            continue
-        return lambda stored, length: _decode_whole(library.ZstdDecompressor(), stored, length)
+    """A function from stored bytes and a length to decoded bytes, where the package for it is here."""
     try:
         library = import_module("zstandard")
     except ImportError:
         return None
-    return lambda stored, length: _decode_object(library, stored, length)
-
-
-def _decode_whole(decompressor, stored: bytes, length: int) -> bytes:
-    # One byte more than there may be, so that a longer frame shows.
-    payload = decompressor.decompress(stored, max_length=length + 1)
-    return payload if decompressor.eof and not decompressor.unused_data else b""
-
-
-def _decode_object(library, stored: bytes, length: int) -> bytes:
-    reader = library.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).decompressobj()
-    payload = reader.decompress(stored)
-    return payload if reader.eof and not reader.unused_data and len(payload) == length else b""
+    # In one go, because a stream would get a window of up to 2^27 bytes whatever the length.
+    decoder = library.ZstdDecompressor(max_window_size=_LARGEST_WINDOW)
+    return lambda stored, length: decoder.decompress(stored, max_output_size=length)

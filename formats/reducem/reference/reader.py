@@ -52,6 +52,7 @@ class Scene:
         vertices: The vertices of all blocks in a row, each the three 32-bit patterns of its floats.
         faces: The triangles in the order of the file, each three numbers of `vertices`.
         block_starts: The first triangle of each block, and n.
+        begins: For each triangle 1 where a strip begins, else 0.
         remap: `(face, rotation)` of each triangle, or None.
         nodes: The nodes in their order.
         runs: For each block its runs `(first triangle, triangles)`; None where boxes are not stored.
@@ -63,6 +64,7 @@ class Scene:
     vertices: list = field(default_factory=list)
     faces: list = field(default_factory=list)
     block_starts: list = field(default_factory=lambda: [0])
+    begins: list = field(default_factory=list)
     remap: list | None = None
     nodes: list = field(default_factory=list)
     runs: list | None = None
@@ -284,6 +286,7 @@ def read_block(scene, header, data, word):
     p = (2 + flags) * k
     index = [stream >> p + i * w & (1 << w) - 1 for i in range(c)]
     check_indices(index, q)
+    scene.begins += starts
     first = len(scene.vertices)
     scene.vertices += read_vertices(stream >> p + c * w, q, axes)
     scene.faces += [[first + corner for corner in face] for face in read_faces(starts, turns, flips, index)]
@@ -416,12 +419,15 @@ def read_runs(scene, payload):
 
 
 def check_runs(scene, block, runs):
-    """Refuse runs that are too long, or do not have each triangle of the block once."""
+    """Refuse runs that are too long, in two strips, or do not have each triangle of the block once."""
     triangles = [t for first, count in runs for t in range(first, first + count)]
     if sorted(triangles) != list(range(scene.block_starts[block + 1] - scene.block_starts[block])):
         raise RefusedError("4.5", f"block {block}: not every triangle is in exactly one run")
     if any(count > scene.record["longest_run"] for _, count in runs):
         raise RefusedError("4.5", f"block {block}: a run is longer than the longest")
+    at = scene.block_starts[block]
+    if any(any(scene.begins[at + first + 1 : at + first + count]) for first, count in runs):
+        raise RefusedError("4.5", f"block {block}: a run is in two strips")
 
 
 def read_node(scene, number, payload):
@@ -504,15 +510,20 @@ def read_metadata(payload):
     try:
         text = payload.decode("utf-8")
         check_depth(text)
-        # Numbers are kept as they are written: no number of digits is too large.
-        metadata = json.loads(text, parse_int=str, parse_float=str, parse_constant=refuse_constant)
+        metadata = json.loads(text, parse_int=Number, parse_float=Number, parse_constant=refuse_constant)
     except ValueError as error:
         raise RefusedError("4.7", f"no JSON in UTF-8: {error}") from None
     if not isinstance(metadata, dict):
         raise RefusedError("4.7", "no JSON object")
-    if not all(isinstance(metadata.get(name, ""), str) for name in ("generator", "source", "unit")):
+    if not all(type(metadata.get(name, "")) is str for name in ("generator", "source", "unit")):
         raise RefusedError("4.7", "generator, source or unit is no string")
     return metadata
+
+
+class Number(str):
+    """A number of metadata as it is written: JSON has no limit to its digits."""
+
+    __slots__ = ()
 
 
 def check_depth(text):

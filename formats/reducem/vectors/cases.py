@@ -1,0 +1,915 @@
+"""The conformance vectors: what each file is to show, and what it decodes to or which issues it has."""
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+from make import Axis, Block, Node, Plan, Slot, Strip, decoding, encode, f32
+
+LONGEST_LINE = 800
+BIG = f32(0x7F7FFFFF)
+TINY = f32(1)
+FLAT = Axis()
+
+
+def zigzag(count: int, first: int = 0) -> Strip:
+    """A strip of so many triangles to and fro, over new vertices from `first` on."""
+    return Strip(list(range(first, first + count + 2)), "01" * ((count - 1) // 2) + "0" * ((count - 1) % 2))
+
+
+def points(count: int, shift: int = 0) -> list[tuple[float, float, float]]:
+    """Points of small whole coordinates along a zigzag."""
+    return [(float(shift + i // 2), float(i % 2), float(i * i % 7)) for i in range(count)]
+
+
+def triangle(xs: tuple[float, float, float], axis: Axis | None = None) -> Block:
+    """One triangle with these x, stored as `axis` says."""
+    ys, zs = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    return Block([Strip([0, 1, 2])], list(zip(xs, ys, zs, strict=True)), (axis, None, None))
+
+
+def blocks_of(count: int, each: int = 2) -> list[Block]:
+    """Blocks of one strip each, side by side."""
+    return [Block([zigzag(each)], points(each + 2, shift=3 * i)) for i in range(count)]
+
+
+def limited(count: int) -> list[Block]:
+    """Blocks of two strips and as many vertices as there may be, 256 triangles each but the last."""
+    whole = [Block([zigzag(128), zigzag(128, 126)], points(256)) for _ in range(count // 256)]
+    rest = count % 256
+    if rest > 128:
+        whole.append(Block([zigzag(128), zigzag(rest - 128, 256 - (rest - 126))], points(256)))
+    elif rest:
+        whole.append(Block([zigzag(rest)], points(rest + 2)))
+    return whole
+
+
+def lonely(count: int) -> Block:
+    """A block in which every triangle is a strip of its own, over vertices used again at the end."""
+    rows = [[i, i + 1, i + 2] for i in range(min(count, 254))] + [
+        [i + 2, i + 1, i] for i in range(count - 254)
+    ]
+    return Block([Strip(row) for row in rows], points(min(count + 2, 256)))
+
+
+def fan(turns: str) -> Block:
+    """A strip with these turns over points that do not matter."""
+    return Block([Strip(list(range(len(turns) + 3)), turns)], points(len(turns) + 3))
+
+
+def frame(data: bytes, *, kind: int = 0, descriptor: int = 0xE0, tail: bytes = b"") -> bytes:
+    """A Zstandard frame of one block: 0 as it is, 1 the first byte repeated."""
+    size = struct.pack("<Q", len(data)) if descriptor >= 0xC0 else b""
+    head = struct.pack("<I", 0xFD2FB528) + bytes([descriptor]) + size
+    block = (1 | kind << 1 | len(data) << 3).to_bytes(3, "little")
+    return head + block + (data[:1] if kind else data) + tail
+
+
+# Valid ones
+
+TRIANGLE = Block([Strip([0, 1, 2])], [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 3.0, 1.0)])
+TURNS = {count: ["".join(bits) for bits in product("01", repeat=count - 1)] for count in (2, 3, 4)}
+FLIPPED = [Strip([0, 1, 2, 3, 4], "01", "01"), Strip([4, 3, 5, 6], "1", "1"), Strip([6, 5, 7])]
+DEEP = '{"a": ' + "[" * 31 + '"[[["' + "]" * 31 + "}"
+
+
+def valid_plans() -> dict[str, tuple[str, Plan]]:
+    """The valid files by name, with what each is to show."""
+    made = {
+        "empty": ("a scene without a triangle", Plan([])),
+        "empty_metadata": ("an empty scene with metadata", Plan([], metadata={"unit": "m"})),
+        "triangle": ("one triangle", Plan([TRIANGLE])),
+        "two_blocks": ("two blocks, boxes rebuilt", Plan(blocks_of(2))),
+        "worked_example": ("the example of SPEC.md, section 9", worked_example()),
+        "error_bound": ("a bound, and all the source faces there may be", _bound()),
+    }
+    for group in (_turns(), _limits(), _widths(), _exponents(), _floats(), _boxes(), _containers(), _sides()):
+        made |= group
+    return made
+
+
+def worked_example() -> Plan:
+    """The scene whose bytes stand in the specification."""
+    first = [(0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.0, 2.0, 1.0), (1.5, 2.0, 1.0), (0.5, 4.0, 1.0)]
+    second = [(2.5, -0.0, 1.0), (3.5, 0.0, 1.0), (2.5, 2.0, 1.0), (3.5, 2.0, 1.25)]
+    blocks = [Block([Strip([0, 1, 2, 3, 4], "10")], first), Block([Strip([0, 1, 2, 3], "0", "1")], second)]
+    left, right = Slot(False, (0, 0, 0), (6, 8, 0)), Slot(False, (10, 0, 0), (14, 8, 1))
+    nodes = [
+        Node([left, right]),
+        Node([left]),
+        Node([Slot(False, (0, 0, 0), (4, 8, 1))], leaves=1, origin=(10, 0, 0)),
+    ]
+    fields = {"source_face_count": 6, "longest_run": 3, "cell_x": -2, "cell_y": -1, "cell_z": -2}
+    remap = [(0, 0), (2, 1), (1, 0), (4, 2), (5, 0)]
+    return Plan(blocks, stored=True, nodes=nodes, remap=remap, record=fields)
+
+
+def _bound() -> Plan:
+    return Plan([TRIANGLE], record={"error_bound": 0.1, "source_face_count": 2**32 - 1})
+
+
+def _turns() -> dict[str, tuple[str, Plan]]:
+    made = {}
+    for count, patterns in TURNS.items():
+        strips = [Strip([i * (count + 2) + j for j in range(count + 2)], t) for i, t in enumerate(patterns)]
+        block = Block(strips, points(len(strips) * (count + 2)))
+        made[f"turns_{count}"] = (f"strips of {count} triangles, every pattern of turns", Plan([block]))
+    made["flips"] = ("flipped triangles in two strips of three", Plan([Block(FLIPPED, points(8))]))
+    mixed = [Block(FLIPPED, points(8)), *blocks_of(1)]
+    made["flips_in_one_block"] = ("flips in the first of two blocks", Plan(mixed))
+    for name, turns in (
+        ("equal_29", "0" * 29),
+        ("equal_30", "1" * 30),
+        ("equal_30_and_30", "0" * 30 + "1" * 30),
+    ):
+        made[f"turns_{name}"] = ("as many equal turn bits in a row as its name says", Plan([fan(turns)]))
+    again = [Strip(list(range(33)), "0" * 30), Strip(list(range(32, 65)), "0" * 30)]
+    made["turns_equal_over_strips"] = (
+        "30 equal turns, a new strip, 30 more",
+        Plan([Block(again, points(65))]),
+    )
+    return made
+
+
+def _limits() -> dict[str, tuple[str, Plan]]:
+    made = {}
+    for count in (255, 256, 257, 512):
+        made[f"triangles_{count}"] = ("triangles about the limit of a block", Plan(limited(count)))
+    for count in (3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 127, 128, 129, 254, 255, 256):
+        block = Block([zigzag(count - 2)], points(count))
+        made[f"vertices_{count}"] = ("vertices about the widths of an index", Plan([block]))
+    for count in (2, 255, 256):
+        made[f"strips_{count}"] = ("strips about the limit of a block", Plan([lonely(count)]))
+    return made
+
+
+def _widths() -> dict[str, tuple[str, Plan]]:
+    made = {}
+    for width in (0, 1, 2, 7, 8, 23, 24, 25, 31, 32):
+        low = -(2 ** max(width - 1, 0))
+        top = 2**width - 1
+        # A float32 holds 24 bits of a number, so the largest of more bits ends in zeros.
+        high = low + (top >> max(width - 24, 0) << max(width - 24, 0))
+        if width == 32:
+            low, high = -(2**31) + 128, 2**31 - 128
+        block = triangle((float(low), float(high), 0.0 if width > 1 else float(low)), Axis(low, width))
+        made[f"width_{width}"] = ("numbers of as many bits, from nothing to all set", Plan([block]))
+    wide = Axis(-1000, 24, 0, 140)
+    block = Block(TRIANGLE.strips, TRIANGLE.points, (wide, wide, Axis(-(2**31), 32)))
+    made["width_too_large"] = ("more bits, a lower anchor, a finer exponent than needed", Plan([block]))
+    block = triangle((0.0, 1.0, 2.0), Axis(7, 3, 0, 148))
+    block.points = [(3.5, 0.0, 0.0), (5.0, 1.0, 0.0), (4.5, 0.0, 1.0)]
+    made["anchor"] = ("an anchor that no vertex has as its coordinate, in halves", Plan([block]))
+    return made
+
+
+def _exponents() -> dict[str, tuple[str, Plan]]:
+    least = triangle((TINY, 3 * TINY, -2 * TINY), Axis(-2, 3, 0, 0))
+    finer = triangle((2 * TINY, 0.0, -2 * TINY), Axis(-1, 2, 0, 1))
+    most = (2.0**22 - 1) * 2.0**106
+    largest = triangle((most, -most, 0.0), Axis(-(2**22) + 1, 23, 0, 255))
+    greatest = triangle((BIG, -BIG, 2.0**104), Axis(-(2**24) + 1, 25, 0, 253))
+    edge = triangle((float(2**31 - 128), 128.0 - 2**31, 0.0), Axis(-(2**31), 32))
+    return {
+        "exponent_0": ("the smallest denormals", Plan([least])),
+        "exponent_1": ("twice the smallest denormal", Plan([finer])),
+        "exponent_255": ("the largest exponent", Plan([largest])),
+        "largest_float": ("the largest floats, in mode 0", Plan([greatest])),
+        "number_at_its_limit": ("A + u next to its limits, from the least anchor", Plan([edge])),
+    }
+
+
+def _floats() -> dict[str, tuple[str, Plan]]:
+    narrow = triangle((-0.0, 0.0, 0.0), Axis(0, 1, 1))
+    wide = triangle((-0.0, 5.0, -5.0), Axis(-5, 32, 1))
+    only = triangle((-0.0, -0.0, -0.0), Axis(2**31 - 1, 1, 1))
+    codes = triangle((-0.0, TINY, -TINY), Axis(-2, 2, 2, 0))
+    ends = triangle((BIG, -BIG, -0.0), Axis(-0x7F800000, 32, 2, 0))
+    same = triangle((-0.0, -0.0, -0.0), Axis(-1, 0, 2, 0))
+    mixed = triangle((f32(0x00800000), f32(0x007FFFFF), f32(0x3F800001)), Axis(0x007FFFFF, 30, 2, 0))
+    shared = Block(
+        [Strip([0, 1, 2]), Strip([3, 4, 5])], [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)] * 2
+    )
+    flat = Block([Strip([0, 1, 2])], [(1.0, 1.0, 1.0)] * 3)
+    grid = triangle((0.0625, -0.0, 3.0), Axis(0, 6, 1, 145))
+    coarse = Block([Strip([0, 1, 2])], [(0.0, 0.0, 0.0), (2.0**104, 0.0, 0.0), (0.0, -(2.0**127), 2.0**105)])
+    return {
+        "mode_1_narrow": ("-0.0 among 0.0, in one bit", Plan([narrow])),
+        "mode_1_wide": ("-0.0 as 32 set bits", Plan([wide])),
+        "mode_1_only": ("-0.0 alone, under an anchor that is no float32", Plan([only])),
+        "mode_2_about_zero": ("-0.0 and the smallest denormals by their bits", Plan([codes])),
+        "mode_2_ends": ("the largest floats by their bits", Plan([ends])),
+        "mode_2_same": ("-0.0 by its bits, in none", Plan([same])),
+        "mode_2_denormal": ("the border of the denormals by their bits", Plan([mixed])),
+        "vertices_alike": ("two vertices of one block with the same bits", Plan([shared])),
+        "point": ("a triangle in one point, its bounds too", Plan([flat])),
+        "grid": (
+            "positions on a grid, -0.0 among them",
+            Plan([grid], grid=-4, record={"error_bound": 0.03125}),
+        ),
+        "grid_finest": ("the finest grid", Plan([triangle((TINY, 0.0, 1.0))], grid=-149)),
+        "grid_coarsest": ("the coarsest grid", Plan([coarse], grid=104)),
+    }
+
+
+def _boxes() -> dict[str, tuple[str, Plan]]:
+    eight = Block([zigzag(8), zigzag(1, 10)], points(13))
+    many = Block([zigzag(3, 5 * i) for i in range(20)], points(100))
+    mixed = [Block(FLIPPED, points(8)), *blocks_of(2), eight]
+    shuffled = [[(2, 1), (0, 2)], [(0, 1), (1, 1)]]
+    blocks = [Block([zigzag(3)], points(5)), *blocks_of(1)]
+    short = Plan(blocks, stored=True, runs=shuffled, record={"longest_run": 2})
+    return {
+        "boxes_triangle": ("stored boxes of one block: no nodes over blocks", Plan([TRIANGLE], stored=True)),
+        "boxes_two_blocks": ("stored boxes of two blocks", Plan(blocks_of(2), stored=True)),
+        "boxes_four_blocks": ("stored boxes of unlike blocks", Plan(mixed, stored=True)),
+        "boxes_eight": ("a run of eight and one of one", Plan([eight], stored=True)),
+        "boxes_many_runs": ("twenty runs, under inner nodes", Plan([many], stored=True)),
+        "boxes_many_blocks": (
+            "twelve blocks, under inner nodes over blocks",
+            Plan(blocks_of(12), stored=True),
+        ),
+        "boxes_rebuilt_many_blocks": ("twelve blocks, nodes over blocks only", Plan(blocks_of(12))),
+        "boxes_runs_in_any_order": ("runs of up to two, the last first", short),
+        "boxes_no_long_run": ("a longest run that no run has", Plan([TRIANGLE], stored=True)),
+        "boxes_limit": ("as many runs and triangles as a block may have", Plan([lonely(256)], stored=True)),
+        "boxes_chain": ("a chain of nodes, one inner child each", _chain()),
+        "boxes_gaps": ("empty slots between inner children and leaves", _gaps()),
+        "boxes_far": ("the largest origins and shifts, boxes wider than need be", _far()),
+        "boxes_finest_cell": ("cells of 2^-149", _finest()),
+        "boxes_coarsest_cell": ("cells of 2^127, planes beyond any float", _coarsest()),
+        "boxes_exact": ("a plane that holds by less than a float64 can tell", _exact(1.0)),
+    }
+
+
+def _chain() -> Plan:
+    whole = ((0, 0, 0), (255, 255, 255))
+    nodes = [Node([Slot(True, *whole)], base=i + 1) for i in range(11)]
+    return Plan([TRIANGLE], stored=True, nodes=[*nodes, Node([Slot(False, *whole)])])
+
+
+def _gaps() -> Plan:
+    whole = ((0, 0, 0), (255, 255, 255))
+    inner, leaf = Slot(True, *whole), Slot(False, *whole)
+    nodes = [
+        Node([None, leaf, None, inner, leaf, None, inner, leaf], base=1),
+        Node([None, None, None, None, None, None, None, leaf], leaves=3 << 24),
+        Node([leaf, None, leaf], leaves=4 << 24),
+    ]
+    return Plan([Block([zigzag(1, 3 * i) for i in range(6)], points(18))], stored=True, nodes=nodes)
+
+
+def _far() -> Plan:
+    far = Block([Strip([0, 1, 2])], [(100.0, 100.0, 100.0), (101.0, 100.0, 100.0), (100.0, 101.0, 100.0)])
+    low, high = Slot(False, (0, 0, 0), (255, 255, 255)), Slot(False, (1, 1, 1), (2, 2, 2))
+    nodes = [
+        Node([low, low], shifts=(15, 14, 13)),
+        Node([low], shifts=(15, 15, 15)),
+        Node([high], leaves=1, origin=(65535, 65535, 65535), shifts=(15, 15, 15)),
+    ]
+    return Plan(
+        [TRIANGLE, far], stored=True, nodes=nodes, record=dict.fromkeys(("cell_x", "cell_y", "cell_z"), -10)
+    )
+
+
+def _finest() -> Plan:
+    block = Block([Strip([0, 1, 2])], [(TINY, 3 * TINY, 0.0), (255 * TINY, 0.0, TINY), (2 * TINY, TINY, 0.0)])
+    nodes = [Node([Slot(False, (0, 0, 0), (254, 3, 1))])]
+    return Plan([block], stored=True, nodes=nodes, record=dict.fromkeys(("cell_x", "cell_y", "cell_z"), -149))
+
+
+def _coarsest() -> Plan:
+    block = Block([Strip([0, 1, 2])], [(-BIG, -BIG, 0.0), (BIG, 0.0, 1.0), (0.0, BIG, 0.0)])
+    nodes = [Node([Slot(False, (0, 0, 0), (255, 4, 1))], shifts=(15, 0, 0))]
+    return Plan([block], stored=True, nodes=nodes, record=dict.fromkeys(("cell_x", "cell_y", "cell_z"), 127))
+
+
+def _exact(low: float) -> Plan:
+    """Positions from `low` to 2^127 in a box that ends 2^127 above `low`: too early where low is negative."""
+    block = triangle((low, 2.0**127, 2.0))
+    nodes = [Node([Slot(False, (0, 0, 0), (1, 1, 1))])]
+    return Plan([block], stored=True, nodes=nodes, record={"cell_x": 127})
+
+
+def _containers() -> dict[str, tuple[str, Plan]]:
+    unknown = [("XTRA", 0, 0, b"anything"), ("\xff\0\n|", 0, 7, b"\0")]
+    back = ("META", "RUNS", "RMAP", "NODE", "BLKD", "BLKH", "SCEN")
+    odd = Plan(blocks_of(2), stored=True, remap=[(3, 0), (2, 1), (1, 2), (0, 0)], metadata={}, order=back)
+    packed = dict.fromkeys(("BLKH", "BLKD", "NODE", "RUNS", "RMAP", "META"), frame)
+    archive = Plan(blocks_of(2), stored=True, remap=odd.remap, metadata={"unit": "in"}, packed=packed)
+    full = Plan([TRIANGLE], extra=[(f"X{i:03}", 0, 0, b"x") for i in range(61)])
+    return {
+        "unknown_sections": ("sections that nobody knows and nobody needs", Plan([TRIANGLE], extra=unknown)),
+        "sections_64": ("as many sections as there may be", full),
+        "sections_backwards": ("the sections in another order", odd),
+        "archive": ("sections of codec 1, their frames without compression", archive),
+        "archive_windowed": ("a frame with a window and no length", _windowed()),
+    }
+
+
+def _windowed() -> Plan:
+    def pack(data: bytes) -> bytes:
+        return frame(data, descriptor=0, tail=b"")[:5] + bytes([0x88]) + frame(data, descriptor=0)[5:]
+
+    return Plan([TRIANGLE], packed={"BLKD": pack})
+
+
+def _sides() -> dict[str, tuple[str, Plan]]:
+    made = {}
+    for count in (1, 3, 4, 5):
+        remap = [(2 * (count - t), (t + 2) % 3) for t in range(count)]
+        plan = Plan(
+            [Block([zigzag(count)], points(count + 2))], remap=remap, record={"source_face_count": 11}
+        )
+        made[f"remap_{count}"] = ("source faces and rotations", plan)
+    made["remap_flips"] = (
+        "rotations of flipped triangles",
+        Plan([Block(FLIPPED, points(8))], remap=[(i, i % 3) for i in range(6)]),
+    )
+    texts = {
+        "metadata": '{"generator": "by hand", "source": "\u00e4\U0001f600.ply", "unit": "mm", "x": [1]}',
+        "metadata_empty": "{}",
+        "metadata_deep": DEEP,
+        "metadata_numbers": f'{{"huge": 1e999, "long": {"7" * 5000}, "minus": -0}}',
+        "metadata_brackets": '{"' + "[" * 40 + '": "\\"{{{{{{{{{{{{{{{{{{{{{{{{{{{{{{{{{{\\\\"}',
+    }
+    about = "text, names and numbers that JSON allows"
+    return made | {name: (about, Plan([TRIANGLE], metadata=text.encode())) for name, text in texts.items()}
+
+
+# Invalid ones
+
+
+def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
+    """The invalid files by name, with what is wrong and the codes of the issues that a validator finds."""
+    made: dict[str, tuple[str, list[str], bytes]] = {}
+    for group in (_cut(), _headers(), _entries(), _needs(), _records(), _block_headers(), _block_data()):
+        made |= group
+    for group in (_coordinates(), _nodes(), _runs(), _remaps(), _metadata(), _packed()):
+        made |= group
+    return made
+
+
+def wrong(about: str, codes: str, plan: Plan, **changes) -> tuple[str, list[str], bytes]:
+    """A row of `invalid_files`: a plan with changes."""
+    return about, codes.split(), encode(replace(plan, **changes))
+
+
+def patched(at: int, fmt: str, *values: int) -> Callable[[bytes], bytes]:
+    """A change of the bytes from `at` on; a negative place counts from the end."""
+
+    def change(data: bytes) -> bytes:
+        start = at if at >= 0 else len(data) + at
+        new = struct.pack(f"<{fmt}", *values)
+        return data[:start] + new + data[start + len(new) :]
+
+    return change
+
+
+BASE = Plan(blocks_of(2), stored=True, remap=[(0, 0), (1, 1), (2, 2), (3, 0)], metadata={"unit": "m"})
+ONE = Plan([TRIANGLE])
+BOX = Plan([TRIANGLE], stored=True)
+
+
+def _cut() -> dict[str, tuple[str, list[str], bytes]]:
+    data = encode(BASE)
+    ends = {0: "RDM101", 5: "RDM101", 8: "RDM101", 31: "RDM101"}
+    made = {f"cut_{n}": ("cut inside the header", [code], data[:n]) for n, code in ends.items()}
+    made["cut_in_table"] = ("cut inside the section table", ["RDM104", "RDM105"], data[:100])
+    made["cut_after_table"] = ("cut behind the section table", ["RDM104", "RDM109"], data[:312])
+    made["cut_in_section"] = ("cut inside a section", ["RDM104", "RDM109"], data[: len(data) // 2])
+    made["cut_by_one"] = ("the last byte is missing", ["RDM104"], data[:-1])
+    made["cut_by_64"] = ("the last 64 bytes are missing", ["RDM104", "RDM109"], data[:-64])
+    made["longer_by_one"] = ("a byte more", ["RDM104"], data + b"\0")
+    made["longer_by_64"] = ("64 zero bytes more", ["RDM104"], data + bytes(64))
+    made["longer_by_junk"] = ("64 other bytes more", ["RDM104", "RDM108"], data + b"x" * 64)
+    made["twice"] = ("the file twice", ["RDM104", "RDM108"], data + data)
+    return made
+
+
+def _headers() -> dict[str, tuple[str, list[str], bytes]]:
+    text = encode(ONE).replace(b"\r\n", b"\n")
+    return {
+        "magic": wrong("another magic", "RDM102", ONE, header={"magic": b"\x89RDN\r\n\x1a\n"}),
+        "magic_text_mode": ("line ends changed on the way", ["RDM102"], text),
+        "other_file": ("a file of another kind", ["RDM102"], b"ply\nformat ascii 1.0\nend_header\n"),
+        "major_1": wrong("a version to come", "RDM103", ONE, header={"major": 1}),
+        "minor_4": wrong("a version to come", "RDM103", ONE, header={"minor": 4}),
+        "minor_2": wrong("a version gone", "RDM103", ONE, header={"minor": 2}),
+        "no_sections": wrong("no sections", "RDM105", ONE, header={"section_count": 0}),
+        "sections_65": wrong(
+            "one section too many", "RDM105", ONE, extra=[(f"X{i:03}", 0, 0, b"x") for i in range(62)]
+        ),
+        "sections_many": wrong(
+            "a table longer than the file", "RDM105", ONE, header={"section_count": 2**32 - 1}
+        ),
+        "total_length": wrong(
+            "a length that is not the file's", "RDM104", ONE, header={"total_length": 2**63}
+        ),
+        "header_reserved": wrong("the header's reserved field is set", "RDM107", ONE, header={"reserved": 1}),
+        "header_checksum": wrong("another checksum", "RDM106", ONE, header={"checksum": 0}),
+        "table_bit": wrong(
+            "a checksum of the table changed", "RDM106 RDM118", ONE, edit=patched(32 + 36, "I", 0)
+        ),
+    }
+
+
+def _entries() -> dict[str, tuple[str, list[str], bytes]]:
+    def entry(about: str, codes: str, kind: str, plan: Plan = BASE, **fields) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, plan, entries={kind: fields})
+
+    raw = entry("a raw section of two lengths", "RDM118 RDM902", "META", raw_length=2**40)
+    return {
+        "flag_reserved": entry("a reserved flag", "RDM107", "META", flags=2),
+        "flag_missing": entry(
+            "a section that must be understood says that it need not", "RDM116", "BLKH", flags=0
+        ),
+        "flag_too_many": entry(
+            "a section that need not be understood says that it must", "RDM116", "RMAP", flags=1
+        ),
+        "raw_lengths": (raw[0], ["RDM118", "RDM902"], raw[2]),
+        "raw_checksums": entry("a raw section of two checksums", "RDM118", "META", raw_checksum=0),
+        "stored_checksum": entry("a checksum that does not fit", "RDM110 RDM118", "BLKD", stored_checksum=0),
+        "section_bit": wrong("a bit of a section flipped", "RDM110", BASE, edit=_flip_metadata),
+        "no_length": entry("a section of no bytes", "RDM109", "META", stored_length=0),
+        "no_raw_length": entry("a section of no decoded bytes", "RDM109", "META", raw_length=0),
+        "offset_early": entry("a section over the table", "RDM109", "SCEN", offset=0),
+        "offset_late": entry("a hole between sections", "RDM109", "BLKH", offset=512 + 64),
+        "offset_huge": entry("an offset near 2^64", "RDM109", "BLKH", offset=2**64 - 64),
+        "length_huge": entry("a length near 2^64", "RDM109", "META", stored_length=2**64 - 1),
+        "overlap": entry("a section within another one", "RDM109", "RMAP", stored_length=200, raw_length=200),
+        "padding": wrong("padding is not zero", "RDM108", ONE, padding=1),
+        "kind_twice": wrong("one kind twice", "RDM112", ONE, extra=[("META", 0, 0, b"{}")] * 2),
+        "kind_unknown_twice": wrong(
+            "one unknown kind twice", "RDM112", ONE, extra=[("XTRA", 0, 0, b"x")] * 2
+        ),
+        "unknown_needed": wrong(
+            "an unknown section must be understood", "RDM111", ONE, extra=[("XTRA", 1, 0, b"x")]
+        ),
+        "unknown_checksum": wrong(
+            "an unknown section is damaged",
+            "RDM110 RDM118",
+            ONE,
+            extra=[("XTRA", 0, 0, b"x")],
+            entries={"XTRA": {"stored_checksum": 1}},
+        ),
+        "unknown_reserved": wrong(
+            "a reserved flag of an unknown section", "RDM107", ONE, extra=[("XTRA", 4, 0, b"x")]
+        ),
+    }
+
+
+def _flip_metadata(data: bytes) -> bytes:
+    at = data.rindex(b"unit")
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+def _needs() -> dict[str, tuple[str, list[str], bytes]]:
+    made = {
+        f"no_{kind.lower()}": wrong(f"{kind} is missing", "RDM113", BASE, drop=(kind,))
+        for kind in ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
+    }
+    for kind, extra in (("SCEN", 1), ("BLKH", 32), ("NODE", 64), ("RUNS", 2), ("RMAP", 1)):
+        longer = {kind: lambda data, extra=extra: data + bytes(extra)}
+        made[f"long_{kind.lower()}"] = wrong(f"{kind} is too long", "RDM114", BASE, payloads=longer)
+    more = {"BLKD": lambda data: data + bytes(64)}
+    made["long_blkd"] = wrong("BLKD has more zero bytes than it may", "RDM606", BASE, payloads=more)
+    less = {"BLKD": lambda data: data[:-64]}
+    made["short_blkd"] = wrong(
+        "BLKD has fewer zero bytes than it must", "RDM606", limited(512) and LONG, payloads=less
+    )
+    cut = {"BLKD": lambda data: data[:64]}
+    made["cut_blkd"] = wrong("BLKD ends inside a block", "RDM606", LONG, payloads=cut)
+    odd = {"BLKD": lambda data: data[:-1]}
+    made["odd_blkd"] = wrong("BLKD is no whole words long", "RDM606", ONE, payloads=odd)
+    runs = {"RUNS": lambda _: bytes(6)}
+    made["runs_not_needed"] = wrong("runs where boxes are not stored", "RDM117", ONE, payloads=runs)
+    nodes = {"NODE": lambda _: bytes(64)}
+    made["nodes_not_needed"] = wrong("a node that the counts do not have", "RDM117", ONE, payloads=nodes)
+    blocks = {"BLKH": lambda _: bytes(32)}
+    made["empty_with_blocks"] = wrong("an empty scene with a block", "RDM117", Plan([]), payloads=blocks)
+    remap = {"RMAP": lambda _: b"\0"}
+    made["empty_with_remap"] = wrong("an empty scene with a remap", "RDM117", Plan([]), payloads=remap)
+    return made
+
+
+LONG = Plan(limited(256))
+
+
+def _records() -> dict[str, tuple[str, list[str], bytes]]:
+    def field(about: str, codes: str, plan: Plan = BASE, **fields) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, plan, record=fields)
+
+    nan = float("nan")
+    return {
+        "triangle_count": field(
+            "more triangles than the blocks have", "RDM201", ONE, triangle_count=2, source_face_count=9
+        ),
+        "triangles_none": field("no triangles, and blocks", "RDM201 RDM208", ONE, triangle_count=0),
+        "triangles_huge": field(
+            "2^32 - 1 triangles", "RDM201", ONE, triangle_count=2**32 - 1, source_face_count=2**32 - 1
+        ),
+        "block_count": field(
+            "more blocks than there are", "RDM114 RDM201", ONE, block_count=2, triangle_count=2
+        ),
+        "blocks_huge": field("2^32 - 1 blocks", "RDM114 RDM201", ONE, block_count=2**32 - 1),
+        "node_count": field("fewer nodes than blocks need", "RDM114 RDM201", node_count=2),
+        "nodes_huge": field("2^32 - 1 nodes", "RDM113 RDM201", ONE, node_count=2**32 - 1),
+        "top_none": field("two blocks and no node over them", "RDM201", Plan(blocks_of(2)), top_count=0),
+        "top_of_one": field("one block and a node over it", "RDM201", BOX, top_count=1),
+        "top_too_many": field("more nodes over blocks than nodes", "RDM201", top_count=9),
+        "run_count": field("fewer runs than blocks", "RDM114 RDM201", run_count=1),
+        "runs_without_boxes": field("runs and no stored boxes", "RDM201", ONE, run_count=1),
+        "source_faces": field("fewer source faces than triangles", "RDM201", ONE, source_face_count=0),
+        "flags": field("a reserved flag", "RDM107", ONE, flags=4),
+        "reserved": field("a reserved byte", "RDM107", ONE, reserved=1),
+        "reserved_2": field("a reserved word", "RDM107", ONE, reserved_2=1 << 31),
+        "reserved_3": field("a reserved byte at the end", "RDM107", ONE, reserved_3=bytes(23) + b"\1"),
+        "grid_without": field("a grid exponent and no grid", "RDM203", ONE, grid_exponent=1),
+        "grid_low": field("a grid finer than any", "RDM203", Plan([TRIANGLE], grid=0), grid_exponent=-150),
+        "grid_high": field("a grid coarser than any", "RDM203", Plan([TRIANGLE], grid=0), grid_exponent=105),
+        "grid_off": field(
+            "a coordinate between the cells", "RDM204", Plan([triangle((0.0, 1.0, 0.5))], grid=0)
+        ),
+        "error_negative": field("a negative bound", "RDM202", ONE, error_bound=-1.0),
+        "error_nan": field("a bound that is no number", "RDM202", ONE, error_bound=nan),
+        "error_infinite": field("a bound without end", "RDM202", ONE, error_bound=float("inf")),
+        "low": field("low is not the least coordinate", "RDM205", ONE, low_x=-1.0),
+        "low_minus_zero": field("low is written as -0.0", "RDM205", ONE, low_y=-0.0),
+        "high": field("high is not the largest coordinate", "RDM205", ONE, high_z=0.5),
+        "high_nan": field("high is no number", "RDM205", ONE, high_z=nan),
+        "cell_low": field("cells finer than any", "RDM206", ONE, cell_x=-150),
+        "cell_high": field("cells coarser than any", "RDM206", ONE, cell_z=128),
+        "longest_none": field("stored boxes and no longest run", "RDM207 RDM802", BOX, longest_run=0),
+        "longest_nine": field("a longest run of nine", "RDM207", BOX, longest_run=9),
+        "longest_without": field("a longest run and no stored boxes", "RDM207", ONE, longest_run=8),
+        "empty_stored": field("an empty scene with stored boxes", "RDM208", Plan([]), flags=1, longest_run=1),
+        "empty_bounds": field("an empty scene with bounds", "RDM208", Plan([]), high_z=-0.0),
+        "empty_cell": field("an empty scene with cells", "RDM208", Plan([]), cell_y=1),
+        "empty_nodes": field("an empty scene with nodes", "RDM113 RDM201", Plan([]), node_count=1),
+    }
+
+
+def _block_headers() -> dict[str, tuple[str, list[str], bytes]]:
+    def header(about: str, codes: str, **fields) -> tuple[str, list[str], bytes]:
+        blocks = [replace(TRIANGLE, header=fields), *blocks_of(1)]
+        return wrong(about, codes, Plan(blocks))
+
+    wide = Block([Strip([0, 1, 2])], TRIANGLE.points, (Axis(0, 33), None, None))
+    minus = Block([Strip([0, 1, 2])], [(0.0, 0.0, 0.0)] * 3, (Axis(0, 0, 1), None, None))
+    later = [TRIANGLE, replace(blocks_of(1)[0], header={"first_triangle": 2})]
+    gap = [TRIANGLE, replace(blocks_of(1)[0], header={"word": 0})]
+    beyond = [TRIANGLE, replace(blocks_of(1)[0], header={"word": 2**32 - 1})]
+    many = header(
+        "vertices without bits, more than indices", "RDM613", vertices=255, axis_x=0, axis_y=0, axis_z=0
+    )
+    return {
+        "first_triangle": header("the first block begins at triangle 1", "RDM601", first_triangle=1),
+        "first_triangle_later": wrong("a block begins one triangle late", "RDM601", Plan(later)),
+        "word": header("the first block begins at word 1", "RDM602", word=1),
+        "word_again": wrong("a block begins where another one does", "RDM602", Plan(gap)),
+        "word_beyond": wrong("a block begins behind the data", "RDM602", Plan(beyond)),
+        "block_triangles": header(
+            "a block says that it has one triangle more", "RDM201 RDM601 RDM612 RDM614", triangles=1
+        ),
+        "block_vertices_two": header("a block of two vertices", "RDM603 RDM605", vertices=1),
+        "block_strips": header("more strips than triangles", "RDM603", strips=1),
+        "block_vertices_many": many,
+        "block_flags": header("a reserved flag of a block", "RDM107", flags=2),
+        "block_reserved": header("a reserved field of a block", "RDM107", reserved=0x8000),
+        "axis_width": wrong("a width of 33 bits", "RDM604", Plan([wide])),
+        "axis_mode": header("mode 3", "RDM604", axis_y=2 | 3 << 6),
+        "axis_mode_1": wrong("mode 1 without a bit", "RDM604", Plan([minus])),
+        "axis_exponent": header("an exponent in mode 2", "RDM604", axis_x=2 | 2 << 6, exponent_x=1),
+    }
+
+
+def _block_data() -> dict[str, tuple[str, list[str], bytes]]:
+    two = Strip([0, 1, 2, 3], "1")
+
+    def part(
+        about: str, codes: str, strips: list[Strip], count: int = 4, **parts
+    ) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, Plan([Block(strips, points(count), parts=parts)]))
+
+    flip = [Strip([0, 1, 2, 3], "1", "0")]
+    long = [Strip(list(range(34)), "0" * 31)]
+    late = [Strip(list(range(36)), "10" + "1" * 31)]
+    return {
+        "no_start": part(
+            "no strip begins at the first triangle", "RDM607", [Strip([0, 1, 2, 3], "0")], starts=[0, 1]
+        ),
+        "starts_too_many": part(
+            "more start bits than strips", "RDM607", [Strip([0, 1, 2, 3], "0")], starts=[1, 1]
+        ),
+        "starts_too_few": part(
+            "fewer start bits than strips", "RDM607", [Strip([0, 1, 2]), Strip([2, 1, 3])], starts=[1, 0]
+        ),
+        "first_turn": part("the first triangle of a strip turns", "RDM608", [two], turns=[1, 0]),
+        "first_flip": part("the first triangle of a strip is flipped", "RDM608", flip, flips=[1, 0]),
+        "no_flip": part("flip bits, and none is set", "RDM609", flip),
+        "turns_equal_31": part("31 equal turn bits in a row", "RDM610", long, 34),
+        "turns_equal_31_late": part("31 equal turn bits after others", "RDM610", late, 36),
+        "index_too_large": part(
+            "an index that names no vertex", "RDM611 RDM612 RDM613", [zigzag(4)], 6, index=[0, 1, 2, 3, 4, 6]
+        ),
+        "index_order": part("indices out of order", "RDM612", [two], index=[0, 2, 1, 3]),
+        "index_first": part("the first index is not 0", "RDM612", [two], index=[1, 0, 2, 3]),
+        "index_unused": part("a vertex that is not used", "RDM613", [two], index=[0, 1, 2, 1]),
+        "triangle_twice": part("a triangle names one vertex twice", "RDM614", [Strip([0, 1, 2, 2], "0")], 3),
+        "triangle_first_twice": part(
+            "a strip's first triangle names one vertex twice",
+            "RDM614",
+            [Strip([0, 1, 1]), Strip([1, 0, 2])],
+            3,
+        ),
+        "unused_bit": wrong("an unused bit of a block", "RDM605", Plan([replace(TRIANGLE, tail=1)])),
+        "unused_word": wrong(
+            "a word behind the last block", "RDM605", ONE, payloads={"BLKD": patched(-1, "B", 128)}
+        ),
+        "unused_first_word": wrong(
+            "the first word behind the last block", "RDM605", ONE, payloads={"BLKD": patched(4, "I", 1)}
+        ),
+    }
+
+
+def _coordinates() -> dict[str, tuple[str, list[str], bytes]]:
+    def bad(about: str, axis: Axis, *numbers: int) -> tuple[str, list[str], bytes]:
+        rows = [[u, 0, 0] for u in numbers]
+        points = [(0.0, 0.0, 0.0)] * 3
+        return wrong(
+            about,
+            "RDM615",
+            Plan([Block([Strip([0, 1, 2])], points, (axis, FLAT, FLAT), parts={"numbers": rows})]),
+        )
+
+    return {
+        "number_2_31": bad("A + u is 2^31", Axis(1, 31), 0, 1, 2**31 - 1),
+        "number_minus_2_31": bad("A + u is -2^31", Axis(-(2**31), 8), 0, 128, 128),
+        "number_25_bits": bad("25 bits that a float32 does not hold", Axis(0, 25), 0, 1, 2**24 + 1),
+        "number_infinite": bad("a product of 2^128", Axis(0, 23, 0, 255), 0, 1, 2**22),
+        "number_minus_infinite": bad("a product of -2^128", Axis(-(2**24), 1, 0, 253), 1, 1, 0),
+        "mode_2_infinite": bad("the bits of infinity", Axis(0x7F7FFFFF, 1, 2, 0), 0, 0, 1),
+        "mode_2_minus_infinite": bad("the bits of minus infinity", Axis(-0x7F800001, 1, 2, 0), 1, 1, 0),
+        "mode_2_nan": bad("the bits of no number", Axis(0x7FFFFFFF, 32, 2, 0), 0, 2**32 - 1, 0),
+        "mode_1_number": bad("mode 1 with a number that no float32 is", Axis(2**24, 2, 1), 0, 1, 3),
+    }
+
+
+def _nodes() -> dict[str, tuple[str, list[str], bytes]]:
+    whole = ((0, 0, 0), (255, 255, 255))
+    inner, leaf = Slot(True, *whole), Slot(False, *whole)
+    three = Plan([Block([zigzag(1, 3 * i) for i in range(3)], points(9))], stored=True)
+    pair = Plan(blocks_of(2), stored=True)
+
+    def of(
+        about: str, codes: str, plan: Plan, *nodes: Node, top: int | None = None
+    ) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, plan, nodes=list(nodes), top=plan.top if top is None else top)
+
+    good = Node([leaf] * 3)
+    roots = (Node([leaf]), Node([leaf], leaves=1))
+    made = {
+        "child_beyond": of(
+            "an inner child behind the last node", "RDM701", three, Node([leaf, leaf, leaf, inner], base=9)
+        ),
+        "child_itself": of("a node that is its own child", "RDM701", three, Node([leaf, leaf, leaf, inner])),
+        "child_before": of(
+            "a child before its parent",
+            "RDM701",
+            three,
+            Node([inner, leaf], base=1),
+            Node([inner, leaf, leaf], leaves=1 << 24),
+        ),
+        "child_twice": of(
+            "one child of two slots",
+            "RDM702",
+            three,
+            Node([inner, inner], base=1),
+            Node([inner, leaf], base=2),
+            Node([leaf, leaf], leaves=1 << 24),
+        ),
+        "child_lost": of("a node that no slot names", "RDM702", three, good, Node([leaf])),
+        "top_child": of(
+            "a node over blocks with a child that is none",
+            "RDM701",
+            pair,
+            Node([leaf, leaf, inner], base=1),
+            *roots,
+        ),
+        "root_child": of(
+            "a block's root with another root as its child",
+            "RDM701",
+            pair,
+            Node([leaf, leaf]),
+            Node([leaf, inner], base=2),
+            roots[1],
+        ),
+        "block_beyond": of("a leaf that is no block", "RDM703", pair, Node([leaf, leaf, leaf]), *roots),
+        "block_twice": of(
+            "one block of two slots",
+            "RDM703",
+            pair,
+            Node([leaf, leaf, inner], base=1),
+            Node([leaf]),
+            *roots,
+            top=2,
+        ),
+        "block_lost": of("a block that no slot names", "RDM703", pair, Node([leaf]), *roots),
+        "run_beyond": of("a leaf that is no run", "RDM704", three, Node([leaf] * 4)),
+        "run_twice": of(
+            "one run of two slots", "RDM704", three, Node([leaf, leaf, leaf, inner], base=1), Node([leaf])
+        ),
+        "run_lost": of("a run that no slot names", "RDM704", three, Node([leaf, leaf])),
+        "run_of_another_block": of(
+            "a leaf in another block", "RDM704", pair, Node([leaf, leaf]), roots[0], roots[0]
+        ),
+        "run_of_no_block": of("a leaf in no block", "RDM704", three, Node([leaf] * 3, leaves=7)),
+        "box_inverted": of(
+            "a box inside out", "RDM705", three, Node([Slot(False, (9, 0, 0), (8, 255, 255)), leaf, leaf])
+        ),
+        "box_half_empty": of(
+            "a slot that is empty on two axes",
+            "RDM704 RDM705",
+            three,
+            Node([leaf] * 3 + [Slot(False, (1, 1, 0), (0, 0, 0))]),
+        ),
+        "box_inner_empty": of(
+            "an inner child with the box of an empty slot",
+            "RDM705",
+            three,
+            Node([leaf, leaf, Slot(True, (1, 1, 1), (0, 0, 0))], base=1),
+            Node([leaf], leaves=2 << 24),
+        ),
+        "base_without": of("a first child and no child", "RDM706", three, good._replace(base=1)),
+        "leaves_without": of(
+            "a first leaf and no leaf", "RDM706", three, Node([inner], base=1, leaves=1 << 24), good
+        ),
+        "node_without": of(
+            "a node without a child", "RDM708", three, Node([leaf, leaf, leaf, inner], base=1), Node([])
+        ),
+        "box_exact": ("a plane that leaks by less than a float64 can tell", ["RDM707"], encode(_exact(-1.0))),
+    }
+    return made | _leaks(pair)
+
+
+def _leaks(plan: Plan) -> dict[str, tuple[str, list[str], bytes]]:
+    """Each plane of a box moved in by one cell, in a leaf, over a block, and over an inner node."""
+    made = {}
+    nodes = plan.nodes or []
+    for side, axis in product(range(2), range(3)):
+        slot = nodes[1].slots[0]
+        planes = [list(slot.low), list(slot.high)]
+        planes[side][axis] += 1 - 2 * side
+        tight = nodes[1]._replace(slots=[Slot(False, tuple(planes[0]), tuple(planes[1]))])
+        name = f"leak_{('low', 'high')[side]}_{'xyz'[axis]}"
+        about = "a box that leaks by one cell"
+        made[name] = wrong(about, "RDM707", plan, nodes=[nodes[0], tight, nodes[2]])
+    over = nodes[0]._replace(slots=[nodes[0].slots[0], nodes[0].slots[1]._replace(high=(3, 1, 4))])
+    made["leak_over_block"] = wrong("a box over a block that leaks", "RDM707", plan, nodes=[over, *nodes[1:]])
+    chain = _chain()
+    slots = [Slot(True, (0, 0, 0), (2, 2, 1))]
+    links = [chain.nodes[0]._replace(slots=slots), *chain.nodes[1:]]
+    made["leak_over_chain"] = wrong("a box over a chain of nodes that leaks", "RDM707", chain, nodes=links)
+    return made
+
+
+def _runs() -> dict[str, tuple[str, list[str], bytes]]:
+    pair = Plan([Block([zigzag(2), zigzag(2, 4)], points(8)), *blocks_of(1)], stored=True)
+    plain = [list(here) for here in pair.runs or []]
+
+    def of(about: str, codes: str, *first: tuple[int, int], **changes) -> tuple[str, list[str], bytes]:
+        return wrong(about, codes, pair, runs=[list(first), plain[1]], nodes=pair.nodes, **changes)
+
+    falling = {"RUNS": patched(0, "2I", 0, 9)}
+    return {
+        "runs_start": of(
+            "the runs of the first block begin at 1",
+            "RDM801",
+            *plain[0],
+            payloads={"RUNS": patched(0, "I", 1)},
+        ),
+        "runs_beyond": of("the runs of a block begin behind the last", "RDM801", *plain[0], payloads=falling),
+        "run_reserved": of(
+            "a reserved bit of a run", "RDM107", *plain[0], payloads={"RUNS": patched(9, "B", 0x81)}
+        ),
+        "run_over_strips": of("a run over two strips", "RDM707 RDM802", (0, 3), (3, 1)),
+        "run_over_blocks": of("a run that ends behind its block", "RDM802", (0, 2), (2, 3)),
+        "run_too_long": of("a run longer than the longest", "RDM802", *plain[0], record={"longest_run": 1}),
+        "run_overlap": of("a triangle in two runs", "RDM803", (0, 2), (1, 1)),
+        "run_gap": of("a triangle in no run", "RDM803", (0, 2), (2, 1)),
+    }
+
+
+def _remaps() -> dict[str, tuple[str, list[str], bytes]]:
+    strip = Plan([Block([zigzag(5)], points(7))])
+    plain = [(i, 0) for i in range(5)]
+    return {
+        "rotation": wrong("a rotation of 3", "RDM501", strip, remap=[*plain[:4], (4, 3)]),
+        "remap_beyond": wrong(
+            "a face that the source does not have", "RDM502", strip, remap=[*plain[:4], (5, 0)]
+        ),
+        "remap_twice": wrong("a face twice", "RDM503", strip, remap=[*plain[:4], (3, 0)]),
+        "remap_unused": wrong(
+            "an unused bit", "RDM504", strip, remap=plain, payloads={"RMAP": patched(-1, "B", 4)}
+        ),
+        "remap_short": wrong(
+            "a remap without rotations", "RDM114", strip, remap=plain, payloads={"RMAP": lambda d: d[:20]}
+        ),
+    }
+
+
+def _metadata() -> dict[str, tuple[str, list[str], bytes]]:
+    texts = {
+        "bytes": (b'{"a": "\xff"}', "RDM901"),
+        "mark": (b"\xef\xbb\xbf{}", "RDM901"),
+        "array": (b"[]", "RDM901"),
+        "words": (b"hello", "RDM901"),
+        "nan": (b'{"a": NaN}', "RDM901"),
+        "cut": (b'{"a": "b', "RDM901"),
+        "twice": (b"{}{}", "RDM901"),
+        "unit": (b'{"unit": 1}', "RDM903"),
+        "names": (b'{"generator": null, "source": []}', "RDM903"),
+        "deep": (DEEP.replace("a", "b").replace(": ", ": [").replace("}", "]}").encode(), "RDM904"),
+        "very_deep": (b"[" * 2000, "RDM904"),
+    }
+    about = "metadata that are not what they must be"
+    return {
+        f"metadata_{name}": wrong(about, codes, ONE, metadata=text) for name, (text, codes) in texts.items()
+    }
+
+
+def _packed() -> dict[str, tuple[str, list[str], bytes]]:
+    def pack(about: str, codes: str, how: Callable[[bytes], bytes], kind: str = "BLKD", **changes) -> tuple:
+        return wrong(about, codes, ONE, packed={kind: how}, **changes)
+
+    large = Plan([TRIANGLE], metadata=b"{}")
+    return {
+        "packed_scene": pack("a packed scene record", "RDM120", frame, "SCEN"),
+        "packed_unknown": wrong("an unknown codec", "RDM119", ONE, entries={"BLKD": {"codec": 2}}),
+        "packed_unknown_remap": wrong("an unknown codec", "RDM119", BASE, entries={"RMAP": {"codec": 65535}}),
+        "packed_raw": pack("codec 1 and no frame", "RDM121", bytes),
+        "packed_cut": pack("a frame cut short", "RDM121", lambda data: frame(data)[:-1]),
+        "packed_longer": pack("a byte behind the frame", "RDM121", lambda data: frame(data, tail=b"\0")),
+        "packed_twice": pack("two frames", "RDM121", lambda data: frame(data) * 2),
+        "packed_other_length": pack("a frame of another length", "RDM121", lambda data: frame(data[:-1])),
+        "packed_dictionary": pack(
+            "a frame with a dictionary", "RDM121", lambda data: frame(data, descriptor=0xE1)
+        ),
+        "packed_window": pack("a window of 2^28 bytes", "RDM121", lambda data: _window(data, 0x90)),
+        "packed_checksum": pack(
+            "a checksum of other bytes", "RDM122", frame, entries={"BLKD": {"raw_checksum": 1}}
+        ),
+        "packed_headers": pack(
+            "block headers longer than the counts say",
+            "RDM114",
+            frame,
+            "BLKH",
+            payloads={"BLKH": lambda d: d * 2},
+        ),
+        "packed_bomb": wrong(
+            "a frame that says it holds 2^60 bytes",
+            "RDM114",
+            ONE,
+            packed={"BLKD": lambda data: frame(data)[:5] + struct.pack("<Q", 2**60) + frame(data)[13:]},
+            entries={"BLKD": {"raw_length": 2**60}},
+        ),
+        "packed_metadata": wrong(
+            "metadata of 2^20 + 1 bytes",
+            "RDM902",
+            large,
+            payloads={"META": lambda _: bytes(2**20 + 1)},
+            packed={"META": lambda data: frame(data[:100], kind=1)},
+        ),
+    }
+
+
+def _window(data: bytes, byte: int) -> bytes:
+    plain = frame(data, descriptor=0)
+    return plain[:5] + bytes([byte]) + plain[5:]
+
+
+def all_files() -> dict[str, bytes]:
+    """Every file of both folders, by its path in this one."""
+    files: dict[str, bytes] = {}
+    for name, (about, plan) in valid_plans().items():
+        files[f"valid/{name}.rdm"] = encode(plan)
+        files[f"valid/{name}.json"] = _lines({"about": about, **decoding(plan)})
+    for name, (about, codes, data) in invalid_files().items():
+        files[f"invalid/{name}.rdm"] = data
+        files[f"invalid/{name}.json"] = _lines({"about": about, "codes": sorted(codes)})
+    return files
+
+
+def _lines(facts: dict) -> bytes:
+    """JSON with a line for each name; a long list only has the SHA-256 of its JSON, in 64 letters."""
+    rows = []
+    for name, value in facts.items():
+        text = json.dumps(value, separators=(",", ":"))
+        if len(text) > LONGEST_LINE:
+            text = json.dumps(hashlib.sha256(text.encode()).hexdigest())
+        rows.append(f"{json.dumps(name)}: {text}")
+    return ("{\n" + ",\n".join(rows) + "\n}\n").encode()

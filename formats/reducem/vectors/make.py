@@ -1,0 +1,536 @@
+"""Write scene files field by field, right ones and wrong ones: the tool behind the conformance vectors.
+
+It is written from SPEC.md alone, on the standard library, and shares no code with striptools or the reference
+reader. It chooses nothing: whatever a field is to hold can be given, so that it writes what no encoder would.
+
+    python make.py           write valid/ and invalid/ beside this file
+    python make.py FOLDER    write them there
+"""
+
+import json
+import math
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+
+MAGIC = b"\x89RDM\r\n\x1a\n"
+MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
+ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "META")
+RECORD = {
+    **dict.fromkeys(("triangle_count", "block_count", "node_count", "top_count", "run_count"), "I"),
+    **{"source_face_count": "I", "flags": "B", "reserved": "B", "grid_exponent": "h", "reserved_2": "I"},
+    **{"error_bound": "d", **dict.fromkeys(("low_x", "low_y", "low_z", "high_x", "high_y", "high_z"), "f")},
+    **{"cell_x": "h", "cell_y": "h", "cell_z": "h", "longest_run": "H", "reserved_3": "24s"},
+}
+ENTRY = {
+    **{"kind": "4s", "flags": "H", "codec": "H", "offset": "Q", "stored_length": "Q", "raw_length": "Q"},
+    **{"stored_checksum": "I", "raw_checksum": "I"},
+}
+HEADER = {
+    "magic": "8s",
+    "major": "H",
+    "minor": "H",
+    "section_count": "I",
+    "total_length": "Q",
+    "reserved": "I",
+}
+BLOCK = {
+    **{"first_triangle": "I", "word": "I", "triangles": "B", "vertices": "B", "strips": "B", "flags": "B"},
+    **dict.fromkeys(("anchor_x", "anchor_y", "anchor_z"), "i"),
+    **dict.fromkeys(("axis_x", "axis_y", "axis_z", "exponent_x", "exponent_y", "exponent_z"), "B"),
+    **{"reserved": "H"},
+}
+
+
+def record(fields: dict[str, str], values: dict) -> bytes:
+    """The bytes of a record whose fields have these types."""
+    return b"".join(struct.pack(f"<{fields[name]}", values[name]) for name in fields)
+
+
+def f32(bits: int) -> float:
+    """The number of a 32-bit pattern."""
+    return struct.unpack("<f", struct.pack("<I", bits))[0]
+
+
+def bits32(value: float) -> int:
+    """The 32-bit pattern of a number that a float32 holds."""
+    return struct.unpack("<I", struct.pack("<f", value))[0]
+
+
+# Blocks
+
+
+class Axis(NamedTuple):
+    """How one axis of a block is stored; `exponent` is the byte, e + 149."""
+
+    anchor: int = 0
+    width: int = 0
+    mode: int = 0
+    exponent: int = 149
+
+
+class Strip(NamedTuple):
+    """A strip's vertices, and a letter 0 or 1 for the turn and the flip of each triangle but the first."""
+
+    index: list[int]
+    turns: str = ""
+    flips: str = ""
+
+
+@dataclass
+class Block:
+    """A block: strips over points, and what its header and stream hold instead of what they should.
+
+    `axes` has an `Axis` or None, the narrowest, for each axis. `header` overrides fields of the header,
+    `parts` the lists `starts`, `turns`, `flips`, `index` and `numbers` (q rows of three) of the stream, and
+    `tail` the unused bits at its end.
+    """
+
+    strips: list[Strip]
+    points: list[tuple[float, float, float]]
+    axes: tuple[Axis | None, Axis | None, Axis | None] = (None, None, None)
+    header: dict = field(default_factory=dict)
+    parts: dict = field(default_factory=dict)
+    tail: int = 0
+
+    @property
+    def lengths(self) -> list[int]:
+        """The triangles of each strip."""
+        return [len(strip.turns) + 1 for strip in self.strips]
+
+    @property
+    def count(self) -> int:
+        """Triangles."""
+        return sum(self.lengths)
+
+    @property
+    def has_flips(self) -> bool:
+        """Whether any strip gives flips."""
+        return any(strip.flips for strip in self.strips)
+
+
+def narrowest(values: list[float]) -> Axis:
+    """The fewest bits that hold these coordinates: mode 0, 1 for -0.0, 2 for numbers that are too long."""
+    cells = [int(Fraction(value) * 2**149) for value in values]
+    step = math.gcd(*cells) or 1
+    exponent = min((step & -step).bit_length() - 1, 255) if any(cells) else 149
+    numbers = [cell >> exponent if any(cells) else 0 for cell in cells]
+    minus = any(value == 0 and math.copysign(1, value) < 0 for value in values)
+    if max(map(abs, numbers)) >= 2**31:
+        places = [place(value) for value in values]
+        return Axis(min(places), (max(places) - min(places)).bit_length(), 2, 0)
+    spread = max(numbers) - min(numbers)
+    return Axis(min(numbers), (spread + minus).bit_length(), int(minus), exponent)
+
+
+def place(value: float) -> int:
+    """A float32's number in the order of all of them: what mode 2 stores."""
+    bits = bits32(value)
+    return bits if bits < 2**31 else -1 - (bits - 2**31)
+
+
+def number(value: float, axis: Axis) -> int:
+    """The number `u` that stores a coordinate."""
+    if axis.mode == 2:
+        return place(value) - axis.anchor
+    if axis.mode == 1 and value == 0 and math.copysign(1, value) < 0:
+        return 2**axis.width - 1
+    cells = Fraction(value) * 2**149 / 2**axis.exponent
+    return int(cells) - axis.anchor
+
+
+def encode_block(block: Block, first_triangle: int, word: int) -> tuple[bytes, bytes]:
+    """The header and the words of a block."""
+    columns = list(zip(*block.points, strict=True))
+    axes = [axis or narrowest(list(c)) for axis, c in zip(block.axes, columns, strict=True)]
+    starts = [int(i == 0) for length in block.lengths for i in range(length)]
+    turns = [int(bit) for strip in block.strips for bit in "0" + strip.turns]
+    flips = [int(bit) for s in block.strips for bit in "0" + (s.flips or "0" * len(s.turns))]
+    index = [i for strip in block.strips for i in strip.index]
+    numbers = [[number(x, axis) for x, axis in zip(p, axes, strict=True)] for p in block.points]
+    parts = {
+        "starts": starts,
+        "turns": turns,
+        "flips": flips,
+        "index": index,
+        "numbers": numbers,
+    } | block.parts
+    width = (len(block.points) - 1).bit_length()
+    rows = [(bit, 1) for bit in parts["starts"] + parts["turns"]]
+    rows += [(bit, 1) for bit in parts["flips"] if block.has_flips]
+    rows += [(i, width) for i in parts["index"]]
+    rows += [(u, axis.width) for row in parts["numbers"] for u, axis in zip(row, axes, strict=True)]
+    header = {
+        "first_triangle": first_triangle,
+        "word": word,
+        "triangles": block.count - 1,
+        "vertices": len(block.points) - 1,
+        "strips": len(block.strips) - 1,
+        "flags": int(block.has_flips),
+        "reserved": 0,
+    }
+    for letter, axis in zip("xyz", axes, strict=True):
+        header |= {f"anchor_{letter}": axis.anchor, f"axis_{letter}": axis.width | axis.mode << 6}
+        header[f"exponent_{letter}"] = axis.exponent
+    return record(BLOCK, header | block.header), stream(rows, block.tail)
+
+
+def stream(rows: list[tuple[int, int]], tail: int = 0) -> bytes:
+    """Whole words of numbers of some bits each, lowest first."""
+    total = at = 0
+    for value, width in rows:
+        total |= (value & (1 << width) - 1) << at
+        at += width
+    words = -(-at // 32)
+    return (total | tail << at).to_bytes(4 * words, "little")
+
+
+def walk(strip: Strip) -> list[list[int]]:
+    """The triangles of a strip by the loop of section 4.3."""
+    a, b, c = strip.index[:3]
+    faces = [[a, b, c]]
+    flips = strip.flips or "0" * len(strip.turns)
+    for w, turn, flip in zip(strip.index[3:], strip.turns, flips, strict=True):
+        a, b, c = (a, c, w) if turn == "1" else (c, b, w)
+        faces.append([b, a, c] if flip == "1" else [a, b, c])
+    return faces
+
+
+# Nodes
+
+
+class Slot(NamedTuple):
+    """A slot of a node that is not empty: inner or leaf, and the bytes of its box."""
+
+    is_inner: bool
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+
+class Node(NamedTuple):
+    """A node as it is written; `slots` has None for an empty slot and may be shorter than eight."""
+
+    slots: list[Slot | None]
+    base: int = 0
+    leaves: int = 0
+    origin: tuple[int, int, int] = (0, 0, 0)
+    shifts: tuple[int, int, int] = (0, 0, 0)
+
+
+def encode_node(node: Node) -> bytes:
+    """The 64 bytes of a node."""
+    slots = [*node.slots, *[None] * (8 - len(node.slots))]
+    inner = sum((slot is not None and slot.is_inner) << i for i, slot in enumerate(slots))
+    x, y, z = node.shifts
+    head = struct.pack("<II3HBB", node.base | x << 28, node.leaves, *node.origin, inner, y | z << 4)
+    low = [slot.low[axis] if slot else 1 for axis in range(3) for slot in slots]
+    high = [slot.high[axis] if slot else 0 for axis in range(3) for slot in slots]
+    return head + bytes(low) + bytes(high)
+
+
+def decoded_node(node: Node, is_top: bool) -> list:
+    """What each slot names and the integers of its planes, as a reader gives them."""
+    inner = leaf = 0
+    slots = []
+    for slot in [*node.slots, *[None] * (8 - len(node.slots))]:
+        if slot is None:
+            slots.append(None)
+            continue
+        if slot.is_inner:
+            child, inner = ["node", node.base + inner], inner + 1
+        elif is_top:
+            child, leaf = ["block", node.leaves + leaf], leaf + 1
+        else:
+            child, leaf = ["run", node.leaves % 2**24, (node.leaves >> 24) + leaf], leaf + 1
+        planes = [
+            [node.origin[axis] + (side[axis] << node.shifts[axis]) for side in (slot.low, slot.high)]
+            for axis in range(3)
+        ]
+        slots.append([child, planes])
+    return slots
+
+
+def cut_runs(blocks: list[Block], longest: int = 8) -> list[list[tuple[int, int]]]:
+    """The runs of each block: its strips from their first triangle on, cut at the longest."""
+    runs = []
+    for block in blocks:
+        here, first = [], 0
+        for length in block.lengths:
+            here += [(first + i, min(longest, length - i)) for i in range(0, length, longest)]
+            first += length
+        runs.append(here)
+    return runs
+
+
+def plain_nodes(
+    blocks: list[Block], runs: list[list[tuple[int, int]]] | None, cells: tuple[int, int, int] = (0, 0, 0)
+) -> list[Node]:
+    """Nodes of up to eight neighbours, for coordinates that spread over no more than 255 cells."""
+    low = scene_bounds(blocks)[:3]
+    block_boxes = [cell_box(block.points, low, cells) for block in blocks]
+    top = [Node([])] if len(blocks) > 1 else []
+    if top:
+        grow(top, 0, 0, block_boxes, None)
+    if runs is None:
+        return top
+    nodes = top + [Node([]) for _ in blocks]
+    for i, (block, here) in enumerate(zip(blocks, runs, strict=True)):
+        faces = [face for strip in block.strips for face in walk(strip)]
+        corners = [{v for face in faces[first : first + count] for v in face} for first, count in here]
+        boxes = [cell_box([block.points[v] for v in run], low, cells) for run in corners]
+        grow(nodes, len(top) + i, 0, boxes, i)
+    return nodes
+
+
+def grow(nodes: list[Node], at: int, first: int, boxes: list, block: int | None) -> None:
+    """Fill node `at` with leaves from `first` on, blocks or runs of one, under inner nodes where many."""
+    if len(boxes) <= 8:
+        leaves = first if block is None else first << 24 | block
+        nodes[at] = Node([Slot(False, *box) for box in boxes], leaves=leaves)
+        return
+    size = -(-len(boxes) // 8)
+    parts = [boxes[i : i + size] for i in range(0, len(boxes), size)]
+    base = len(nodes)
+    nodes += [Node([]) for _ in parts]
+    nodes[at] = Node([Slot(True, *union(part)) for part in parts], base=base)
+    for i, part in enumerate(parts):
+        grow(nodes, base + i, first + i * size, part, block)
+
+
+def cell_box(points: list, low: list[float], cells: tuple[int, int, int]) -> tuple[tuple, tuple]:
+    """The bytes of the box of points, in whole cells around them."""
+    sides = [
+        [(Fraction(p[axis]) - Fraction(low[axis])) / Fraction(2) ** cells[axis] for p in points]
+        for axis in range(3)
+    ]
+    return tuple(math.floor(min(side)) for side in sides), tuple(math.ceil(max(side)) for side in sides)
+
+
+def fitting_cells(blocks: list[Block]) -> tuple[int, int, int]:
+    """The finest cells of which the scene is no more than 255 wide."""
+    bounds = [Fraction(bound) for bound in scene_bounds(blocks)]
+    spreads = [(high - low) * 2**149 for low, high in zip(bounds[:3], bounds[3:], strict=True)]
+    x, y, z = (max(0, int(spread / 255).bit_length()) - 149 for spread in spreads)
+    return x, y, z
+
+
+def union(boxes: list) -> tuple[tuple, tuple]:
+    """The box around boxes."""
+    return (
+        tuple(min(box[0][axis] for box in boxes) for axis in range(3)),
+        tuple(max(box[1][axis] for box in boxes) for axis in range(3)),
+    )
+
+
+def scene_bounds(blocks: list[Block]) -> list[float]:
+    """The six bounds of all points, -0.0 as 0.0."""
+    columns = list(zip(*[point for block in blocks for point in block.points], strict=True))
+    return [min(c) + 0.0 for c in columns] + [max(c) + 0.0 for c in columns]
+
+
+# Files
+
+
+@dataclass
+class Plan:
+    """A scene file to write; what is None is left out, or is what it should be.
+
+    Attributes:
+        blocks: The blocks.
+        stored: Whether boxes are stored.
+        nodes: The nodes; None for plain ones.
+        top: How many of them are over blocks; None for as many as plain ones have.
+        runs: `(first, count)` for each run of each block; None for strips cut at the longest.
+        remap: `(face, rotation)` of each triangle.
+        metadata: An object, or the bytes of META.
+        grid: The grid exponent.
+        cells: The exponents of the cells of plain nodes.
+        record: Fields of SCEN that hold something else.
+        payloads: For a kind, what is done to the bytes of the section before it is written.
+        packed: For a kind, what makes its stored bytes, which get codec 1.
+        entries: For a kind, fields of its row in the section table that hold something else.
+        extra: Further sections `(kind, flags, codec, bytes)`.
+        drop: Kinds to leave out.
+        order: The order of kinds; None for the writer's, further ones last.
+        header: Fields of the file header that hold something else.
+        padding: The byte that fills up.
+        edit: What is done to the bytes of the whole file, its checksums left as they are.
+    """
+
+    blocks: list[Block]
+    stored: bool = False
+    nodes: list[Node] | None = None
+    top: int | None = None
+    runs: list[list[tuple[int, int]]] | None = None
+    remap: list[tuple[int, int]] | None = None
+    metadata: dict | bytes | None = None
+    grid: int | None = None
+    cells: tuple[int, int, int] = (0, 0, 0)
+    record: dict = field(default_factory=dict)
+    payloads: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
+    packed: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
+    entries: dict[str, dict] = field(default_factory=dict)
+    extra: list[tuple[str, int, int, bytes]] = field(default_factory=list)
+    drop: tuple[str, ...] = ()
+    order: tuple[str, ...] | None = None
+    header: dict = field(default_factory=dict)
+    padding: int = 0
+    edit: Callable[[bytes], bytes] = bytes
+
+    def __post_init__(self) -> None:
+        """Fill in plain runs and nodes."""
+        if self.stored and self.runs is None:
+            self.runs = cut_runs(self.blocks)
+        if self.nodes is None:
+            wanted = self.stored or len(self.blocks) > 1
+            self.nodes = plain_nodes(self.blocks, self.runs, self.cells) if wanted else []
+        if self.top is None:
+            plain = len(plain_nodes(self.blocks, None, self.cells)) if len(self.blocks) > 1 else 0
+            self.top = min(plain, len(self.nodes))
+
+    @property
+    def count(self) -> int:
+        """Triangles."""
+        return sum(block.count for block in self.blocks)
+
+
+def encode(plan: Plan) -> bytes:
+    """The bytes of a scene file."""
+    payloads = {kind: data for kind, data in sections(plan).items() if data and kind not in plan.drop}
+    for kind, change in plan.payloads.items():
+        payloads[kind] = change(payloads.get(kind, b""))
+    rows = [(kind, int(kind in MUST_UNDERSTAND), 0, data, data) for kind, data in payloads.items()]
+    rows += [(kind, flags, codec, data, data) for kind, flags, codec, data in plan.extra]
+    rows = [
+        (kind, flags, 1, plan.packed[kind](raw), raw)
+        if kind in plan.packed
+        else (kind, flags, codec, data, raw)
+        for kind, flags, codec, data, raw in rows
+    ]
+    if plan.order:
+        rows.sort(key=lambda row: plan.order.index(row[0]))
+    return plan.edit(container(plan, rows))
+
+
+def container(plan: Plan, rows: list[tuple[str, int, int, bytes, bytes]]) -> bytes:
+    """Header, table and sections one behind the other."""
+    table, body = b"", b""
+    start = 32 + 40 * len(rows)
+    for kind, flags, codec, stored, raw in rows:
+        body += bytes([plan.padding]) * (-(start + len(body)) % 64)
+        entry = {
+            "kind": kind.encode("latin-1"),
+            "flags": flags,
+            "codec": codec,
+            "offset": start + len(body),
+            "stored_length": len(stored),
+            "raw_length": len(raw),
+            "stored_checksum": zlib.crc32(stored),
+            "raw_checksum": zlib.crc32(raw),
+        }
+        table += record(ENTRY, entry | plan.entries.get(kind, {}))
+        body += stored
+    body += bytes([plan.padding]) * (-(start + len(body)) % 64)
+    header = {"magic": MAGIC, "major": 0, "minor": 3, "section_count": len(rows), "reserved": 0}
+    header["total_length"] = start + len(body)
+    head = record(HEADER, header | plan.header)
+    checksum = plan.header.get("checksum", zlib.crc32(head + table))
+    return head + struct.pack("<I", checksum) + table + body
+
+
+def sections(plan: Plan) -> dict[str, bytes]:
+    """The raw bytes of the sections of a plan; empty ones are to be left out."""
+    headers, data, first = b"", b"", 0
+    for block in plan.blocks:
+        header, words = encode_block(block, first, len(data) // 4)
+        headers, data, first = headers + header, data + words, first + block.count
+    if data:
+        data += bytes(64)
+        data += bytes(-len(data) % 64)
+    runs = b""
+    if plan.runs is not None:
+        at = [sum(map(len, plan.runs[:i])) for i in range(len(plan.runs))]
+        words = [first | count - 1 << 8 for here in plan.runs for first, count in here]
+        runs = struct.pack(f"<{len(at)}I{len(words)}H", *at, *words)
+    remap = b""
+    if plan.remap is not None:
+        remap = struct.pack(f"<{len(plan.remap)}I", *[face for face, _ in plan.remap])
+        packed = stream([(rotation, 2) for _, rotation in plan.remap])
+        remap += packed[: -(-len(plan.remap) // 4)]
+    metadata = plan.metadata or b""
+    if isinstance(metadata, dict):
+        metadata = json.dumps(metadata, ensure_ascii=False).encode()
+    nodes = b"".join(encode_node(node) for node in plan.nodes or [])
+    made = (record(RECORD, scene_record(plan)), headers, data, nodes, runs, remap, metadata)
+    return dict(zip(ORDER, made, strict=True))
+
+
+def scene_record(plan: Plan) -> dict:
+    """The fields of SCEN."""
+    bounds = scene_bounds(plan.blocks) if plan.blocks else [0.0] * 6
+    names = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
+    return {
+        "triangle_count": plan.count,
+        "block_count": len(plan.blocks),
+        "node_count": len(plan.nodes or []),
+        "top_count": plan.top,
+        "run_count": sum(map(len, plan.runs or [])),
+        "source_face_count": plan.count,
+        "flags": int(plan.stored) | (plan.grid is not None) << 1,
+        "reserved": 0,
+        "grid_exponent": plan.grid or 0,
+        "reserved_2": 0,
+        "error_bound": 0.0,
+        **dict(zip(names, bounds, strict=True)),
+        **dict(zip(("cell_x", "cell_y", "cell_z"), plan.cells, strict=True)),
+        "longest_run": 8 if plan.stored else 0,
+        "reserved_3": bytes(24),
+    } | plan.record
+
+
+def decoding(plan: Plan) -> dict:
+    """What a reader makes of a valid plan: floats as the hexadecimal of their bits, x, y and z in a row.
+
+    Fields of the record that are not there are zero.
+    """
+    first, faces, vertices = 0, [], []
+    for block in plan.blocks:
+        faces += [[first + v for v in face] for strip in block.strips for face in walk(strip)]
+        vertices += ["".join(f"{bits32(x):08x}" for x in point) for point in block.points]
+        first += len(block.points)
+    fields = scene_record(plan)
+    skipped = [kind for kind, *_ in plan.extra]
+    metadata = plan.metadata or {}
+    if isinstance(metadata, bytes):
+        metadata = json.loads(metadata, parse_int=str, parse_float=str)
+    return {
+        "record": {name: value for name, value in fields.items() if value and value != bytes(24)},
+        "blocks": [block.count for block in plan.blocks],
+        "vertices": vertices,
+        "faces": faces,
+        "remap": plan.remap,
+        "runs": plan.runs,
+        "nodes": [decoded_node(node, i < (plan.top or 0)) for i, node in enumerate(plan.nodes or [])],
+        "metadata": metadata,
+        "passed_over": skipped,
+        "packed": sorted(plan.packed),
+    }
+
+
+def write(folder: Path) -> None:
+    """Write all vectors below a folder, and nothing else."""
+    from cases import all_files
+
+    for name, data in all_files().items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent)
