@@ -1,6 +1,7 @@
 """The format's own programs, loaded from formats/reducem, and what all readers of a file must agree on."""
 
 import importlib.util
+import re
 import struct
 import sys
 import zlib
@@ -66,26 +67,38 @@ def agree(data: bytes) -> set[str]:
         The codes of its errors.
     """
     errors = errors_of(data)
-    try:
-        decoded = reference.read(data)
-    except reference.RefusedError as refusal:
-        needs_more = refusal.clause == "6" and "Zstandard" in str(refusal)
-        assert errors or needs_more, str(refusal)
-        decoded = None
+    decoded, refusal = outcome(reference.read, data)
+    if decoded is None:
+        assert errors or "a Zstandard decoder" in refusal, refusal
     else:
         assert errors <= UNSEEN, errors
-    try:
-        scene = read_scene(data)
-    except MissingExtraError:
-        return errors
-    except UnreadableSceneError as refusal:
-        code = str(refusal).split("RDM")[1][:3]
-        assert f"RDM{code}" in errors | {"RDM124"}, (str(refusal), errors)
+    scene, refusal = outcome(read_scene, data)
+    if scene is None:
+        codes = re.findall(r"RDM\d\d\d", refusal)
+        assert "pip install" in refusal or codes == ["RDM124"] or known(codes, errors), (refusal, errors)
     else:
         assert not errors, errors
         if decoded is not None:
             assert_same(scene, decoded)
     return errors
+
+
+def outcome(read, data: bytes) -> tuple[object, str]:
+    """What a reader makes of a file, or None and what it says."""
+    try:
+        return read(data), ""
+    except (reference.RefusedError, MissingExtraError, UnreadableSceneError) as refusal:
+        return None, str(refusal)
+
+
+def known(codes: list[str], errors: set[str]) -> bool:
+    """Whether a reader gives a code for which the validator has one too."""
+    return any(alike(code, error) for code in codes[-1:] for error in errors)
+
+
+def alike(code: str, other: str) -> bool:
+    """Whether readers may give these codes to one flaw: of one part, or of a count and what is counted."""
+    return code[:4] == other[:4] or {code, other} in ({"RDM114", "RDM606"}, {"RDM201", "RDM601"})
 
 
 def assert_same(scene, decoded) -> None:

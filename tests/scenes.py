@@ -1,51 +1,55 @@
 """Scenes for the tests, made by the real stages."""
 
-import struct
-import zlib
-
 import numpy as np
 from hypothesis import strategies as st
 from strategies import clean_meshes
 
-from striptools.hierarchies.strip_bvh import build_strip_hierarchy
+from striptools.hierarchies.packed import box_grid, build_top
 from striptools.mesh.adjacency import build_adjacency
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.cut import cut_tree
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
-from striptools.reducem.scene import scene_from_strips
+from striptools.reducem.scene import bounds_of, scene_from_strips
+from striptools.strips.grouping import group_sequences, reorder_blocks
 from striptools.strips.ordering import OrderingOptions, order_strips
 from striptools.strips.stripify import order_cut
-from striptools.strips.topology import encode_strips
+from striptools.strips.topology import encode_strips, split_fans
 
 
-def scene_of(mesh, *, remap=True, max_length=64, spare_faces=0, flips=False):
+def scene_of(mesh, *, remap=True, max_length=64, spare_faces=0, flips=False, block=256, boxes="rebuilt"):
     """The scene of a cleaned mesh, as if its source had `spare_faces` more faces, before the others.
 
     With `flips` strips cross edges that both faces run the same way, wherever that links two more.
     """
-    boxes = face_boxes(mesh.positions, mesh.faces)
-    tree = split_objects(boxes, PartitionOptions())
-    adjacency = build_adjacency(mesh.faces, mesh.vertex_count)
-    sequences = order_strips(adjacency, mesh.faces, tree, OrderingOptions(max_length=max_length))
+    face_box = face_boxes(mesh.positions, mesh.faces)
+    tree = split_objects(face_box, PartitionOptions())
     if flips:
-        sequences = order_cut(mesh.faces, mesh.vertex_count, boxes, tree, cut_tree(tree, 10**6), max_length)
-    strip_boxes = range_boxes(np.ascontiguousarray(boxes[sequences.faces]), sequences.starts)
-    lengths = np.diff(sequences.starts).astype(np.int32)
-    order, hierarchy = build_strip_hierarchy(strip_boxes, lengths, PartitionOptions())
-    strips = encode_strips(mesh.faces, sequences.reordered(order))
-    source_face = np.arange(spare_faces, spare_faces + mesh.triangle_count, dtype=np.int32)
-    return scene_from_strips(
+        sequences = order_cut(
+            mesh.faces, mesh.vertex_count, face_box, tree, cut_tree(tree, 10**6), max_length
+        )
+    else:
+        adjacency = build_adjacency(mesh.faces, mesh.vertex_count)
+        sequences = order_strips(adjacency, mesh.faces, tree, OrderingOptions(max_length=max_length))
+    sequences, starts = group_sequences(sequences, mesh.faces, mesh.vertex_count, face_box, block)
+    block_boxes = range_boxes(face_box, starts, sequences.faces)
+    order, top = build_top(block_boxes, np.diff(starts), box_grid(*bounds_of(mesh.positions)))
+    sequences, starts = reorder_blocks(sequences, starts, order)
+    scene = scene_from_strips(
         mesh.positions,
-        strips,
-        hierarchy,
-        source_face=source_face if remap else None,
+        split_fans(encode_strips(mesh.faces, sequences), mesh.faces),
+        starts,
+        top,
+        source_face=np.arange(spare_faces, spare_faces + mesh.triangle_count, dtype=np.int32)
+        if remap
+        else None,
         source_face_count=mesh.triangle_count + spare_faces,
     )
+    return scene.storing_boxes() if boxes == "stored" else scene
 
 
-def small_scene(*, remap=True, flips=False):
+def small_scene(*, remap=True, flips=False, block=256, boxes="rebuilt"):
     """Thirteen triangles in several strips: a bent grid of twelve and one apart; some turns are set.
 
     With `flips` every third triangle runs the other way, and some flip bits are set.
@@ -59,30 +63,19 @@ def small_scene(*, remap=True, flips=False):
     faces = np.array(faces, np.int32)
     if flips:
         faces[::3] = faces[::3, ::-1]
-    return scene_of(Mesh(positions, faces), remap=remap, max_length=5, spare_faces=2, flips=flips)
+    options = {"block": block, "boxes": boxes}
+    return scene_of(Mesh(positions, faces), **options, remap=remap, max_length=5, spare_faces=2, flips=flips)
 
 
 @st.composite
 def scenes(draw):
     """The scene of any clean mesh, with its source."""
     mesh = draw(clean_meshes())
-    most = draw(st.sampled_from([1, 2, 5, 64]))
-    return mesh, scene_of(mesh, remap=draw(st.booleans()), max_length=most, flips=draw(st.booleans()))
-
-
-def table_of(data):
-    """The section table as lists `[kind, flags, offset, length, checksum, reserved]`."""
-    count = struct.unpack_from("<I", data, 12)[0]
-    return [list(row) for row in struct.iter_unpack("<4sIQQII", bytes(data[32 : 32 + 32 * count]))]
-
-
-def with_checksums(data):
-    """The same bytes with every checksum that can be found made to fit."""
-    data = bytearray(data)
-    rows = table_of(data)
-    for at, (_, _, offset, length, _, _) in enumerate(rows):
-        if offset + length <= len(data):
-            struct.pack_into("<I", data, 32 + 32 * at + 24, zlib.crc32(data[offset : offset + length]))
-    table_end = 32 + 32 * len(rows)
-    struct.pack_into("<I", data, 28, zlib.crc32(data[:28] + data[32:table_end]))
-    return bytes(data)
+    options = {
+        "remap": draw(st.booleans()),
+        "max_length": draw(st.sampled_from([1, 2, 5, 64])),
+        "flips": draw(st.booleans()),
+        "block": draw(st.sampled_from([4, 16, 256])),
+        "boxes": draw(st.sampled_from(["rebuilt", "stored"])),
+    }
+    return mesh, scene_of(mesh, **options)

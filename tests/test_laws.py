@@ -7,7 +7,6 @@ import pytest
 from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import scenes, small_scene
 
 from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene

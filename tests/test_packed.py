@@ -198,7 +198,7 @@ FAULTS = {
     "has a base": lambda b, n, r, runs, first: n.__setitem__(
         (first_bottom(b), 0), n[first_bottom(b), 0] + np.uint32(1)
     ),
-    "a top node has not one parent": lambda b, n, r, runs, first: n.__setitem__((0, 0), n[0, 0] + 1),
+    "none of the nodes that it may be": lambda b, n, r, runs, first: n.__setitem__((0, 0), n[0, 0] + 1),
     "a node has not one parent": lambda b, n, r, runs, first: n.__setitem__(
         (first_inner(b), 0), n[first_inner(b), 0] + 1
     ),
@@ -232,7 +232,7 @@ def test_counts_that_do_not_fit_are_found(ball):
         ({"longest_run": 0}, "longest run"),
         ({"longest_run": 3}, "too long"),
         ({"runs": None}, "as a whole"),
-        ({"nodes": ball.packed.nodes[:-1]}, "one parent"),
+        ({"nodes": ball.packed.nodes[:-1]}, "that it may be"),
     ]:
         with pytest.raises(UnreadableSceneError, match=flaw):
             check(ball, replace(ball.packed, **change))

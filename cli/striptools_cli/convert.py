@@ -4,6 +4,7 @@ import dataclasses
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Annotated, cast
 
@@ -13,14 +14,16 @@ from striptools.errors import UnreadableMeshError, UsageError
 from striptools.mesh.clean import CleanOptions, clean
 from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.partition.sah import LARGEST_BLOCK, SMALLEST_BLOCK
+from striptools.partition.sah import SMALLEST_BLOCK
 from striptools.pipeline import Options, Report, convert_with_report
+from striptools.reducem.quantize import LEAST_BITS, MOST_BITS, PrecisionOptions
 from striptools.reducem.reader import read_scene
-from striptools.reducem.scene import Scene
+from striptools.reducem.scene import BoxesKind, Scene
 from striptools.stopwatch import Stopwatch
 from striptools.strips.export import STRIP_FORMATS, export_strips
 from striptools.strips.ordering import (
     EFFORT_NAMES,
+    LARGEST_STRIP_BLOCK,
     METHODS,
     EffortName,
     Method,
@@ -42,6 +45,7 @@ from striptools_cli.streams import (
 
 _CLEAN = CleanOptions()
 _ORDER = OrderingOptions()
+_OPTIONS = Options()
 
 _SAID_OF_COUNTS = {
     "non_finite": "dropped {} with a non-finite vertex|face|faces",
@@ -51,6 +55,13 @@ _SAID_OF_COUNTS = {
     "duplicate_faces_kept": "kept {} (--drop-duplicates drops them)|duplicate face|duplicate faces",
     "vertices_welded": "welded {}|vertex|vertices",
     "vertices_unreferenced": "left out {} that no face uses|vertex|vertices",
+}
+
+_SAID_OF_GRIDS = {
+    "quantised_vertices_welded": "welded {} that met|vertex|vertices",
+    "quantised_repeated_vertex": "dropped {} with a repeated vertex|face|faces",
+    "quantised_zero_area": "dropped {} of zero area|face|faces",
+    "quantised_flipped": "turned over {}, kept|face|faces",
 }
 
 
@@ -72,6 +83,31 @@ def run(
     drop_duplicates: Annotated[
         bool, typer.Option("--drop-duplicates", help="Keep one of several faces with the same corners.")
     ] = _CLEAN.drop_duplicates,
+    bits: Annotated[
+        int | None,
+        typer.Option(
+            min=LEAST_BITS,
+            max=MOST_BITS,
+            metavar="B",
+            help="Move vertices to a grid of 2^B cells along the longest side.",
+            show_default="keep every bit",
+        ),
+    ] = None,
+    max_error: Annotated[
+        str | None,
+        typer.Option(
+            metavar="D",
+            help="The coarsest grid that moves no vertex by more than D, or Drel diagonals, like 1e-4rel.",
+            show_default="keep every bit",
+        ),
+    ] = None,
+    boxes: Annotated[
+        BoxesKind,
+        typer.Option(help="Rebuild the boxes inside blocks when a scene is traced, or store them."),
+    ] = _OPTIONS.boxes,
+    archive: Annotated[
+        bool, typer.Option("--archive", help="Compress the scene for transport; needs the extra archive.")
+    ] = False,
     max_length: Annotated[
         int, typer.Option(min=1, metavar="N", help="Most triangles in a strip.")
     ] = _ORDER.max_length,
@@ -83,15 +119,14 @@ def run(
         typer.Option(metavar="NAME", help=f"How long strip-rt searches: {', '.join(EFFORT_NAMES)}."),
     ] = _ORDER.effort,
     block: Annotated[
-        int | None,
+        int,
         typer.Option(
             min=SMALLEST_BLOCK,
-            max=LARGEST_BLOCK,
+            max=LARGEST_STRIP_BLOCK,
             metavar="N",
-            help="Cut into blocks of at most N triangles and N vertices, and order inside them (strip-rt).",
-            show_default="no blocks",
+            help="Most triangles and most vertices of a block.",
         ),
-    ] = _ORDER.block,
+    ] = LARGEST_STRIP_BLOCK,
     flips: Annotated[
         bool,
         typer.Option(
@@ -146,6 +181,8 @@ def run(
             block,
             flips,
         ),
+        precision=_precision(bits, max_error),
+        boxes=boxes,
         remap=not no_remap,
         threads=threads,
     )
@@ -154,12 +191,14 @@ def run(
     out = Target.open(target, force=force)
     file = Source.open(source)
     read_format = input_format(file, from_format)
+    if archive and (strips or write_format != SCENE_FORMAT):
+        raise UsageError("--archive compresses a scene, but OUT is none", remedy="leave it out")
     if strips:
         _check_strips(read_format, write_format, options)
         job = _to_strips
     else:
         _check_direction(read_format, write_format, options)
-        job = _to_mesh if read_format == SCENE_FORMAT else _to_scene
+        job = _to_mesh if read_format == SCENE_FORMAT else partial(_to_scene, archive=archive)
     outcome = job(file, out, options, (read_format, write_format), quiet)
     if report:
         Target.open(report, force=True).write(lambda file: _write_text(file, render(outcome.facts, "json")))
@@ -211,8 +250,21 @@ def _check_names(source: str, target: str, report: str | None) -> None:
             raise UsageError("--report and OUT cannot both be standard output", remedy="name a file for one")
 
 
+def _precision(bits: int | None, max_error: str | None) -> PrecisionOptions:
+    if max_error is None:
+        return PrecisionOptions(bits)
+    relative = max_error.endswith("rel")
+    try:
+        largest = float(max_error.removesuffix("rel"))
+    except ValueError:
+        raise UsageError(
+            f"{max_error!r} is no error", where="--max-error", remedy="give a number, or one like 1e-4rel"
+        ) from None
+    return PrecisionOptions(bits, largest, relative)
+
+
 def _to_scene(
-    source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool
+    source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool, *, archive: bool
 ) -> _Outcome:
     notice.before_kernels("strip_chunks", quiet=quiet)
     clock = Stopwatch()
@@ -222,7 +274,7 @@ def _to_scene(
         )
         progress.watch("write", 0.0)
         with clock.stage("write"):
-            target.write(scene.save)
+            target.write(partial(scene.save, archive=archive))
     written, peak = clock.read()
     total = report.seconds["total"] + written["write"]
     seconds = _ordered({**report.seconds, "write": written["write"], "total": total})
@@ -233,6 +285,8 @@ def _to_scene(
         "counts": {**report.counts, "triangles": scene.triangle_count, "vertices": scene.vertex_count},
         "largest_rounding": report.largest_rounding,
         "weld_error": report.weld_error,
+        "error_bound": scene.error_bound,
+        "largest_error": report.largest_error,
         "notes": list(report.notes),
     }
     return _Outcome(lines, list(_details(seconds, scene)), facts)
@@ -304,7 +358,9 @@ def _loaded_clean(
     cleaned = clean(mesh, options.clean)
     if cleaned.mesh.triangle_count == 0:
         raise UnreadableMeshError("no face is left after cleaning", where=source.title)
-    report = Report({}, 0, cleaned.counts, cleaned.largest_rounding, cleaned.weld_error, mesh.notes)
+    report = Report(
+        {}, 0, cleaned.counts, cleaned.largest_rounding, cleaned.weld_error, None, None, mesh.notes
+    )
     return cleaned.mesh, list(_changes(report)), cleaned.counts
 
 
@@ -323,27 +379,35 @@ def _density(scene: Scene) -> str:
 def _changes(report: Report) -> Iterator[str]:
     for note in report.notes:
         yield f"  loaded: {note}"
-    for key, pattern in _SAID_OF_COUNTS.items():
-        count = report.counts.get(key, 0)
-        if count:
-            sentence, one, many = pattern.split("|")
-            yield f"  cleaned: {sentence.format(f'{count:,} {one if count == 1 else many}')}"
+    yield from _said(report, "cleaned", _SAID_OF_COUNTS)
     if report.largest_rounding > 0.0:
         yield f"  cleaned: rounded to float32, by at most {human_value(report.largest_rounding)}"
     if report.weld_error > 0.0:
         yield f"  cleaned: welding moved vertices, by at most {human_value(report.weld_error)}"
+    if report.grid_exponent is not None and report.largest_error is not None:
+        cell, most = human_value(2.0**report.grid_exponent), human_value(report.largest_error)
+        yield f"  quantised: to a grid of {cell}, vertices moved by at most {most}"
+        yield from _said(report, "quantised", _SAID_OF_GRIDS)
+
+
+def _said(report: Report, stage: str, patterns: dict[str, str]) -> Iterator[str]:
+    for key, pattern in patterns.items():
+        count = report.counts.get(key, 0)
+        if count:
+            sentence, one, many = pattern.split("|")
+            yield f"  {stage}: {sentence.format(f'{count:,} {one if count == 1 else many}')}"
 
 
 def _details(seconds: dict[str, float], scene: Scene) -> Iterator[str]:
     yield from _stages(seconds)
     for part, size in scene.part_bytes().items():
         share = size / scene.triangle_count
-        yield f"  {part.replace('_', ' '):<16}{size:12,} bytes  {share:8.3f} per triangle"
+        yield f"  {part.replace('_', ' '):<20}{size:12,} bytes  {share:8.3f} per triangle"
 
 
 def _stages(seconds: dict[str, float]) -> Iterator[str]:
     for stage, duration in seconds.items():
-        yield f"  {stage:<16}{duration:12.3f} s"
+        yield f"  {stage:<20}{duration:12.3f} s"
 
 
 def _ordered(seconds: dict[str, float]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from striptools.reducem.layout import VERSION
@@ -18,9 +19,11 @@ def run(
 ) -> None:
     """Say what is in a scene file, and how many bytes each part takes.
 
-    `vertices` counts stored positions, `vertices_per_triangle` the entries of the strips: n + 2 for
-    a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
-    what tracing needs, so every part but the remap.
+    `vertices` counts those of all blocks, so that one that several blocks share counts for each of them
+    (`vertex_duplication`: how often on the average), `vertices_per_triangle` the entries of the strips: n + 2
+    for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
+    what tracing needs, so every part but the remap, before compression; `resident_bytes_per_triangle` what a
+    tracer holds that traces the blocks as they are, boxes and all.
     """
     log.set_up()
     file = Source.open(source)
@@ -29,25 +32,70 @@ def run(
 
 def describe(scene: Scene) -> dict[str, object]:
     """The facts of a scene, by the names that other programs rely on."""
-    triangles = scene.triangle_count
-    bounds = [[float(corner) for corner in row] for row in (scene.positions.min(0), scene.positions.max(0))]
+    triangles, strips, blocks = scene.triangle_count, scene.strip_count, scene.block_count
+    parts = scene.part_bytes()
+    different = len(np.unique(scene.leaders))
     return {
         "triangles": triangles,
         "vertices": scene.vertex_count,
-        "strips": scene.strip_count,
+        "vertex_duplication": _share(scene.vertex_count, different),
+        "strips": strips,
         "flips": 0 if scene.flips is None else int(scene.flips.sum()),
-        "triangles_per_strip": triangles / scene.strip_count,
+        "triangles_per_strip": _share(triangles, strips),
         "strip_vertices": len(scene.vertices),
-        "vertices_per_triangle": len(scene.vertices) / triangles,
+        "vertices_per_triangle": _share(len(scene.vertices), triangles),
+        "blocks": blocks,
+        "triangles_per_block": _share(triangles, blocks),
+        "boxes": scene.boxes,
         "bytes_per_triangle": scene.bytes_per_triangle(),
-        "bytes": {**scene.part_bytes(), "total": sum(scene.part_bytes().values())},
-        "precision": {
-            "kind": "lossless" if scene.error_bound == 0.0 else "welded",
-            "bits": 32,
-            "error_bound": scene.error_bound,
-        },
+        "resident_bytes_per_triangle": scene.resident_bytes_per_triangle(),
+        "bytes": {**parts, "total": sum(parts.values())},
+        "bytes_per_triangle_by_part": {part: _share(size, triangles) for part, size in parts.items()},
+        "precision": _precision(scene),
+        "axes": _axes(scene),
         "format_version": f"{VERSION[0]}.{VERSION[1]}",
         "remap": scene.remap is not None,
         "source_faces": scene.source_face_count,
-        "bounds": {"lowest": bounds[0], "highest": bounds[1]},
+        "bounds": {"lowest": scene.low.tolist(), "highest": scene.high.tolist()},
+        "metadata": {
+            _printable(name): _printable(str(value)) for name, value in scene.metadata.items()
+        },
     }
+
+
+def _precision(scene: Scene) -> dict[str, object]:
+    exponent = scene.grid_exponent
+    if exponent is None:
+        kind = "lossless" if scene.error_bound == 0.0 else "welded"
+        return {"kind": kind, "bits": 32, "error_bound": scene.error_bound}
+    longest = float((scene.high.astype(np.float64) - scene.low).max(initial=0.0))
+    cells = round(longest / 2.0**exponent)
+    return {
+        "kind": "grid",
+        "bits": cells.bit_length(),
+        "cell": 2.0**exponent,
+        "error_bound": scene.error_bound,
+    }
+
+
+def _axes(scene: Scene) -> dict[str, object]:
+    """How many axes of blocks are written in which mode (SPEC.md, 4.3), and the bits of a vertex."""
+    modes, widths = scene.blocks.axes()
+    counts = np.bincount(modes.reshape(-1), minlength=3).tolist()
+    bits = scene.blocks.totals()["position_bits"]
+    return {
+        "multiples": counts[0],
+        "multiples_and_minus_zero": counts[1],
+        "float_bits": counts[2],
+        "widest": int(widths.max(initial=0)),
+        "bits_per_vertex": _share(bits, scene.vertex_count),
+    }
+
+
+def _printable(text: str) -> str:
+    """Text of strangers without anything that a terminal would obey."""
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else 0.0

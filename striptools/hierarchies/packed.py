@@ -342,11 +342,13 @@ def _check_links(packed: PackedNodes, slots: _Slots, blocks: int) -> SlotChildre
     target = (nodes[:, :1] & 0xFFFFFFF) + np.cumsum(slots.inner, axis=1) - 1
     ranks = np.cumsum(slots.leaf, axis=1) - 1
     is_top = node < top
+    least = np.where(is_top, node, np.maximum(node, top - 1 + blocks * complete))
+    allowed = (target > least) & (target < np.where(is_top, top, len(nodes)))
+    _require(bool(allowed[slots.inner].all()), "a child is none of the nodes that it may be")
     of_top, of_rest = target[slots.inner & is_top], target[slots.inner & ~is_top]
     _require(np.array_equal(np.sort(of_top), np.arange(1, top)), "a top node has not one parent")
     first = top + blocks if complete else top
     _require(np.array_equal(np.sort(of_rest), np.arange(first, len(nodes))), "a node has not one parent")
-    _require(bool((target > node)[slots.inner].all()), "a node comes before its parent")
     block = (nodes[:, 1:2] + ranks)[slots.leaf & is_top]
     _require(top == 0 or np.array_equal(np.sort(block), np.arange(blocks)), "a block has not one parent")
     child = np.where(slots.inner, target, EMPTY)
@@ -389,15 +391,18 @@ def _linked_runs(packed: PackedNodes, slots: _Slots, child: np.ndarray, blocks: 
 def _check_runs(packed: PackedNodes, block_starts: Counts, strip_starts: Counts) -> None:
     """The runs of a block hold its triangles once each, and none goes on in another strip."""
     assert packed.runs is not None
+    assert packed.first_run is not None
     first, count = run_ranges(packed, block_starts)
     _require(not (packed.runs >> 11).any(), "reserved bits of a run are set")
     _require(int(count.max(initial=0)) <= packed.longest_run, "a run is too long")
+    strip = np.searchsorted(strip_starts[:-1], first, side="right") - 1
+    owner = np.searchsorted(packed.first_run, np.arange(len(first)), side="right") - 1
+    end = np.minimum(strip_starts[strip + 1], block_starts[owner + 1])
+    _require(bool((first + count <= end).all()), "a run goes on in another strip")
     order = np.argsort(first, kind="stable")
     ends = np.cumsum(count[order])
     whole = np.array_equal(first[order], ends - count[order]) and int(ends[-1]) == int(block_starts[-1])
     _require(whole, "the runs do not hold every triangle once")
-    strip = np.searchsorted(strip_starts, first, side="right") - 1
-    _require(bool((first + count <= strip_starts[strip + 1]).all()), "a run goes on in another strip")
 
 
 def _check_boxes(slots: _Slots, held: np.ndarray, grid: BoxGrid) -> None:

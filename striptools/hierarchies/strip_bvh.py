@@ -1,4 +1,4 @@
-"""The SAH hierarchy over strips: what a scene file stores above the implicit hierarchies inside the strips.
+"""The SAH hierarchy over strips, above the implicit hierarchies inside them: what strips are measured by.
 
 Source: Lauterbach, Yoon, Tang, Manocha, "ReduceM: Interactive and Memory Efficient Ray Tracing of Large
 Models", EGSR 2008, section 3: a hierarchy whose leaves are strips stands over the strips' own implicit ones.
@@ -18,11 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from striptools.kernels.hierarchy import boxes_from_below
+from striptools.partition.boxes import range_boxes
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
 from striptools.types import Boxes, Counts, Words
 
-__all__ = ["StripHierarchy", "build_strip_hierarchy"]
+__all__ = ["StripHierarchy", "build_block_hierarchy", "build_strip_hierarchy"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,3 +66,45 @@ def build_strip_hierarchy(
     boxes = boxes_from_below(tree.size, np.ascontiguousarray(strip_boxes[tree.order]))
     inner = np.flatnonzero(tree.size > 1)
     return tree.order, StripHierarchy(boxes[inner], tree.size[inner + 1].astype(np.uint32))
+
+
+def build_block_hierarchy(
+    strip_boxes: Boxes,
+    triangle_counts: Counts,
+    block_strips: Counts,
+    options: PartitionOptions,
+    threads: int = 1,
+) -> tuple[Counts, StripHierarchy]:
+    """Build a hierarchy over blocks, and under each block one over its strips, as one hierarchy over strips.
+
+    Args:
+        strip_boxes: (s, 6) float32, s >= 1, the strips of a block one after another.
+        triangle_counts: (s,) int32 triangles of each strip, its weight in the heuristic.
+        block_strips: (b+1,) int32, the first strip of each block, then s.
+        options: Those of the object splits.
+        threads: Threads of the object split over blocks; the result does not depend on it.
+
+    Returns:
+        `order` (s,) int32, the strip that goes to place k, and the hierarchy over the strips in that order.
+    """
+    counts = np.asarray(triangle_counts, np.int32)
+    block_boxes = range_boxes(strip_boxes, block_strips)
+    block_counts = np.add.reduceat(counts, block_strips[:-1]).astype(np.int32)
+    top = split_objects(block_boxes, options, weights=block_counts, threads=threads)
+    strips = np.diff(block_strips)[top.order]
+    behind = np.append(0, np.cumsum(strips))
+    orders, sizes, place = [], [], 0
+    for size in top.size.tolist():
+        if size > 1:
+            # All blocks below it follow, and so do their strips.
+            sizes.append([behind[place + size] - behind[place]])
+            continue
+        begin, end = block_strips[top.order[place]], block_strips[top.order[place] + 1]
+        below = split_objects(strip_boxes[begin:end], options, weights=counts[begin:end])
+        orders.append(begin + below.order)
+        sizes.append(below.size)
+        place += 1
+    order, size = np.concatenate(orders).astype(np.int32), np.concatenate(sizes).astype(np.int32)
+    boxes = boxes_from_below(size, np.ascontiguousarray(strip_boxes[order]))
+    inner = np.flatnonzero(size > 1)
+    return order, StripHierarchy(boxes[inner], size[inner + 1].astype(np.uint32))

@@ -26,6 +26,7 @@ NOT_USED = 13
 REPEATED = 14
 NO_NUMBER = 15
 WRONG_LENGTH = 16
+WRONG_TOTAL = 17
 
 MOST_EQUAL = 30
 """Equal turn bits in a row within a strip, its first triangle's left out."""
@@ -362,7 +363,7 @@ def header_flaw(headers, words, triangle_count):
     # Look at what comes after the last block.
     blocks = headers.shape[0]
     if triangle != triangle_count:
-        return WRONG_FIRST, blocks
+        return WRONG_TOTAL, blocks
     if words.shape[0] != (word + 31 >> 4) << 4:
         return WRONG_LENGTH, blocks
     for k in range(word, words.shape[0]):
@@ -395,6 +396,13 @@ def take_strips(headers, words, block, base, strip, vertices, turns, flips, star
     index_bit = bit + (2 + has_flips) * count
     place = begin + 2 * strip
     strip_end = strip + strips
+    # Make sure that there are as many starts as strips, and no more vertices than indices.
+    for t in range(count):
+        strips -= take(words, bit + t, 1)
+    if strips or not take(words, bit, 1):
+        return WRONG_STARTS
+    if vertex_count > count + 2 * (strip_end - strip):
+        return NOT_USED
     largest = -1
     last_turn = run = flip_count = 0
     a = b = c = -1
@@ -403,8 +411,6 @@ def take_strips(headers, words, block, base, strip, vertices, turns, flips, star
         turn = take(words, bit + count + t, 1)
         flip = take(words, bit + 2 * count + t, 1) & has_flips
         is_first = take(words, bit + t, 1)
-        if (is_first and strip == strip_end) or (t == 0 and not is_first):
-            return WRONG_STARTS
         if is_first and (turn or flip):
             return TURNED_FIRST
         turns[begin + t] = turn
@@ -443,8 +449,6 @@ def take_strips(headers, words, block, base, strip, vertices, turns, flips, star
             c = index
         if a == b or b == c or c == a:
             return REPEATED
-    if strip != strip_end:
-        return WRONG_STARTS
     if has_flips and flip_count == 0:
         return NO_FLIPS
     return SOUND if largest == vertex_count - 1 else NOT_USED

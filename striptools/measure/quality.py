@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from striptools.hierarchies.in_strip import expand_hierarchy
+from striptools.hierarchies.in_strip import BinaryTree, expand_hierarchy
+from striptools.hierarchies.strip_bvh import build_block_hierarchy
 from striptools.partition.boxes import face_boxes, node_boxes, range_boxes
 from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions, expected_cost, half_area
 from striptools.reducem.scene import Scene
+from striptools.strips.ordering import Sequences
 from striptools.strips.topology import RESTART, Strips, classic_strips
 from striptools.types import Bools, Boxes, Counts, RayVectors
 
@@ -44,8 +46,8 @@ class StripQuality:
             triangles and more.
         half_share: half_strip_area over strip_area of the same strips, at most 2: there each half's box is as
             large as its strip's, and the implicit hierarchy gains nothing by it.
-        cost: Expected cost of a ray through the hierarchy over strips and the balanced ones inside, in node
-            visits.
+        cost: Expected cost of a ray through binary hierarchies, one triangle a leaf, in node visits: SAH
+            trees over the blocks and over the strips of each block, balanced ones inside the strips.
         full_cost: The same through a full SAH tree over the triangles, one a leaf, in node visits.
         relative_cost: cost / full_cost.
     """
@@ -88,7 +90,7 @@ def strip_quality(
     """
     boxes = face_boxes(scene.positions, scene.faces())
     lengths = np.diff(scene.starts)
-    tree = expand_hierarchy(scene.hierarchy, scene.starts, boxes)
+    tree = quality_tree(scene, boxes, threads=threads)
     if full_cost is None:
         full_cost = full_tree_cost(boxes, options, threads=threads)
     strip_area, half_area_, half_share = _areas(boxes, scene.starts)
@@ -109,6 +111,23 @@ def strip_quality(
         cost=expected_cost(tree.boxes, tree.size),
         full_cost=full_cost,
     )
+
+
+def quality_tree(scene: Scene, triangle_boxes: Boxes, *, threads: int = 1) -> BinaryTree:
+    """The binary tree that `StripQuality.cost` is the cost of; its triangles are in an order of its own.
+
+    Args:
+        scene: Of at least one triangle.
+        triangle_boxes: (n, 6) float32, in file order.
+        threads: Threads of the split over blocks.
+    """
+    lengths = np.diff(scene.starts)
+    block_strips = np.searchsorted(scene.starts, scene.block_starts).astype(np.int32)
+    strip_boxes = range_boxes(triangle_boxes, scene.starts)
+    given = (strip_boxes, lengths, block_strips, PartitionOptions())
+    order, hierarchy = build_block_hierarchy(*given, threads=threads)
+    places = Sequences(np.arange(len(triangle_boxes), dtype=np.int32), scene.starts).reordered(order)
+    return expand_hierarchy(hierarchy, places.starts, triangle_boxes[places.faces])
 
 
 def length_histogram(lengths: Counts) -> dict[int, int]:
@@ -191,8 +210,9 @@ def _spans(boxes: Boxes, begin: Counts, end: Counts) -> Boxes:
 
 def _classic(scene: Scene) -> tuple[int, int]:
     """Indices of the scene's strips written as classic ones, and how many of these are restarts."""
+    # A vertex of several blocks is one vertex to a classic strip.
     strips = Strips(
-        scene.vertices,
+        scene.leaders[scene.vertices],
         scene.turns,
         scene.starts,
         np.arange(scene.triangle_count, dtype=np.int32),

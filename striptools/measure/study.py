@@ -11,7 +11,7 @@ same program. Differences:
 2. Variants are traced in turn, a slice of the rays each, and compared by the median of the runs' ratios, so
    that what else the machine does falls on all alike.
 3. A turn bit stands for a swap vertex, so strips that turn the same way often cost nothing more here. Memory
-   with swap vertices, four bytes each, as the paper stores them, stands beside it.
+   with swap vertices, an index in its block of a byte each, stands beside it.
 4. STRIPE-like strips and Tipsify's are given without a longest length, as published, and once more with the
    one of Strip-RT.
 5. Speed can be bought with memory: strips of few triangles are compact whoever makes them. So Strip-RT is
@@ -26,7 +26,6 @@ import numpy as np
 from striptools.errors import UsageError
 from striptools.measure.quality import StripQuality, full_tree_cost, strip_quality, traversal_steps
 from striptools.mesh.mesh import Mesh
-from striptools.partition.boxes import face_boxes
 from striptools.pipeline import Options, convert_with_report
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
@@ -39,8 +38,8 @@ from striptools.types import RayVectors
 REFERENCE = "strip-rt"
 """The variant whose rate is divided by those of the others."""
 
-SWAP_BYTES = 4
-"""What a repeated vertex takes: an index of a strip."""
+SWAP_BYTES = 1
+"""What a repeated vertex takes: an index of a block."""
 
 SHORT_LENGTHS = (3, 4, 5, 6, 8, 10, 12, 16, 24, 32, 48)
 """Longest lengths tried, the shortest first, for Strip-RT at no more than Tipsify's memory."""
@@ -122,7 +121,7 @@ class StudyRow:
         method: The method of its ordering.
         max_length: The longest strip it was allowed; None for any length.
         scene_bytes: Bytes of the scene that tracing needs: every part but the remap.
-        swap_bytes: The same with the paper's swap vertices, four bytes each, in place of turn bits.
+        swap_bytes: The same with the paper's swap vertices, a byte each, in place of turn bits.
         order_seconds: Seconds of the stage that made the strips.
         primary_rate: Primary rays a second, in the fastest run.
         secondary_rate: Secondary rays a second, in the fastest run; 0 where no primary ray hit.
@@ -312,7 +311,7 @@ def _seconds(tracer: Tracer, rays: _Rays, part: slice) -> float:
 
 def _qualities(scenes: dict[str, Scene], options: Options) -> dict[str, StripQuality]:
     reference = scenes[REFERENCE]
-    boxes = face_boxes(reference.positions, reference.faces())
+    boxes = reference.triangle_boxes(options.threads)
     threads = options.threads or 1
     full_cost = full_tree_cost(boxes, options.partition, threads=threads)
     return {name: strip_quality(scene, full_cost=full_cost) for name, scene in scenes.items()}
@@ -337,7 +336,7 @@ def _row(
         method=ordering.method,
         max_length=ordering.max_length if ordering.max_length < LARGEST_LENGTH else None,
         scene_bytes=_bytes(scene),
-        swap_bytes=_bytes(scene) - scene.part_bytes()["turns"] + SWAP_BYTES * quality.swaps,
+        swap_bytes=_bytes(scene) - scene.triangle_count // 8 + SWAP_BYTES * quality.swaps,
         order_seconds=seconds,
         primary_rate=primary[0],
         secondary_rate=secondary[0],

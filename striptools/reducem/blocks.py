@@ -29,6 +29,7 @@ SMALLEST_CHUNK = 64
 """Blocks below which another thread is not worth its start."""
 
 _CODES = {
+    kernels.WRONG_TOTAL: "RDM201",
     kernels.WRONG_FIRST: "RDM601",
     kernels.WRONG_WORD: "RDM602",
     kernels.WRONG_COUNTS: "RDM603",
@@ -194,6 +195,8 @@ def check_headers(blocks: Blocks, triangle_count: int, where: str = "scene") -> 
     Raises:
         UnreadableSceneError: They do not.
     """
+    if blocks.count == 0 and len(blocks.words) == triangle_count == 0:
+        return
     _refuse(kernels.header_flaw(blocks.headers, blocks.words, triangle_count), "BLKH", where)
 
 

@@ -29,7 +29,7 @@ _NODE_CODES = {
     "a node without inner children has a base": "RDM706",
     "a node without leaves has leaves": "RDM706",
     "a node has no child": "RDM708",
-    "a node comes before its parent": "RDM701",
+    "a child is none of the nodes that it may be": "RDM701",
     "a top node has not one parent": "RDM702",
     "a node has not one parent": "RDM702",
     "a block has not one parent": "RDM703",

@@ -38,8 +38,8 @@ LONGEST_EQUAL_TURNS = 30
 """The most equal turn bits in a row within a strip, its first triangle's left out."""
 
 MOST_BLOCK_BYTES = 3936
-LEAST_BLOCK_DATA = 128
-"""A block's data are at most so many bytes; block data are at least, and at most by so many, more."""
+MOST_BEHIND_BLOCKS = 128
+"""The most bytes of a block's data, and of what is behind those of the last one."""
 
 ZERO_WORDS = 16
 """Words of zero after the last block's data."""

@@ -225,7 +225,9 @@ class _File:
         """The scene record, the ranges of its fields checked."""
         raw = self.section(layout.SCENE, layout.SCENE_RECORD.size)
         row = np.frombuffer(raw.tobytes(), layout.SCENE_RECORD.dtype)[0]
-        record = {name: row[name].tolist() for name in layout.SCENE_RECORD.dtype.names or ()}
+        record = {field.name: row[field.name].tolist() for field in layout.SCENE_RECORD.fields}
+        if record["triangle_count"] == 0 and raw[_BOUNDS].any():
+            raise unreadable("RDM208", f"{self.where}: SCEN")
         _check_record(record, f"{self.where}: SCEN")
         if record["triangle_count"] > MOST_TRIANGLES or record["source_face_count"] > 2**31 - 1:
             raise unreadable("RDM124", f"{self.where}: SCEN")
@@ -254,8 +256,8 @@ class _File:
     def blocks(self) -> Blocks:
         """The blocks, their headers checked."""
         count, headers = self.record["block_count"], self.headers()
-        most = layout.MOST_BLOCK_BYTES * count + layout.LEAST_BLOCK_DATA if count else 0
-        words = self.section(layout.BLOCK_DATA, layout.LEAST_BLOCK_DATA if count else 0, most)
+        most = layout.MOST_BLOCK_BYTES * count + layout.MOST_BEHIND_BLOCKS if count else 0
+        words = self.section(layout.BLOCK_DATA, layout.ALIGNMENT if count else 0, most)
         if len(words) % 4:
             raise unreadable("RDM606", f"{self.where}: BLKD")
         blocks = Blocks(headers, _array(words, "<u4", np.uint32))
@@ -374,6 +376,9 @@ def _check_entry(entry: _Entry) -> None:
         raise unreadable("RDM120" if section is layout.SCENE else "RDM125", entry.place)
 
 
+_BOUNDS = slice(40, 70)
+"""Low, high and cell in the scene record: all bits are zero where there is no triangle."""
+
 _KNOWN = {section.kind: section for section in layout.SECTIONS}
 
 
@@ -384,9 +389,7 @@ def _check_record(record: dict[str, Any], place: str) -> None:
     stored = record["flags"] & layout.BOXES_STORED
     if record["flags"] > 3 or record["reserved"] or record["reserved_2"] or any(record["reserved_3"]):
         raise unreadable("RDM107", place)
-    if n == 0 and (
-        stored or any(record[f"{key}_{axis}"] for key in ("low", "high", "cell") for axis in "xyz")
-    ):
+    if n == 0 and stored:
         raise unreadable("RDM208", place)
     nodes = m >= top + b if stored else m == top
     counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b

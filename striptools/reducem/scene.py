@@ -165,6 +165,11 @@ class Scene:
         """
         return self._faces
 
+    @cached_property
+    def leaders(self) -> Counts:
+        """(q,) int32, for each vertex the first one that equals it bit for bit."""
+        return weld_vertices(self.positions, threads=every_core())[0]
+
     def triangle_boxes(self, threads: int | None = None) -> Boxes:
         """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
         return face_boxes(self.positions, self.faces(), threads or every_core())
@@ -209,7 +214,7 @@ class Scene:
             back = (np.arange(3) - self.remap.rotation[:, None]) % 3
             order = np.argsort(self.remap.face, kind="stable")
             faces = np.take_along_axis(faces, back, axis=1)[order]
-        leader, _ = weld_vertices(self.positions, threads=every_core())
+        leader = self.leaders
         is_leader = leader == np.arange(len(leader), dtype=np.int32)
         place = np.cumsum(is_leader, dtype=np.int32) - np.int32(1)
         return Mesh(self.positions[is_leader], np.ascontiguousarray(place[leader[faces]]))

@@ -220,9 +220,9 @@ def _contents(inspection: Inspection) -> bool:
     """Look into the sections, each where it and what it leans on are whole."""
     sections = inspection.sections
     _record(inspection, sections["SCEN"])
-    if "BLKH" in sections and "BLKD" in sections:
-        geometry = inspect_blocks(inspection)
-        if geometry is not None and "NODE" in sections:
+    if "BLKH" in sections:
+        geometry = inspect_blocks(inspection) if "BLKD" in sections else None
+        if "NODE" in sections:
             inspect_nodes(inspection, geometry)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])

@@ -83,15 +83,16 @@ def inspect_blocks(inspection: Inspection) -> Geometry | None:
     """Look at the blocks; gives their geometry where all of them could be decoded and are sound."""
     blocks = _headers(inspection, inspection.sections["BLKH"], inspection.sections["BLKD"])
     _places(inspection, blocks)
-    n = int(blocks.k.sum())
+    counted = int(blocks.k.sum()) == int.from_bytes(inspection.sections["SCEN"].data[:4], "little")
+    if not counted:
+        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
     parts = [_decode(inspection, blocks, chunk) for chunk in _chunks(blocks)]
     sound = [part for part in parts if part is not None]
     if not blocks.whole.all() or len(sound) < len(parts):
         return None
     begins, low, high, lowest, highest = (np.concatenate(column) for column in zip(*sound, strict=True))
     _bounds(inspection, lowest, highest)
-    if n != int.from_bytes(inspection.sections["SCEN"].data[:4], "little"):
-        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
+    if not counted:
         return None
     return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, low, high)
 
@@ -141,12 +142,13 @@ def _places(inspection: Inspection, blocks: _Blocks) -> None:
     word = np.cumsum(length) - length
     inspection.found_where("RDM601", blocks.first != first, place, lambda i: headers.at(32 * i))
     blocks.whole &= blocks.word == word
-    if inspection.found_where("RDM602", blocks.word != word, place, lambda i: headers.at(32 * i + 4)):
-        return
+    misplaced = inspection.found_where("RDM602", blocks.word != word, place, lambda i: headers.at(32 * i + 4))
     end = int(length.sum())
     wanted = 4 * (end + 16 + -(end + 16) % 16)
     if len(blocks.data.data) != wanted:
         inspection.found("RDM606", f"BLKD: {len(blocks.data.data)} bytes, not {wanted}", blocks.data.offset)
+    if misplaced:
+        return
     used = 32 * word + blocks.bits
     loose = np.zeros(len(used), np.bool_)
     inside = 32 * (word + length) <= 32 * (len(blocks.words) - 2)

@@ -52,25 +52,24 @@ class _Nodes:
         return np.arange(len(self.rows)) < self.top
 
 
-def inspect_nodes(inspection: Inspection, geometry: Geometry) -> None:
-    """Look at the runs, where boxes are stored, and at the nodes."""
+def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
+    """Look at the runs, where boxes are stored, and at the nodes; without sound blocks, at what nodes name."""
     record = inspection.sections["SCEN"].data
     blocks, count, top, run_count = (int(x) for x in np.frombuffer(record, "<u4", 4, 4))
     stored = record[24] & 1
-    whole = "RUNS" in inspection.sections and count >= top + blocks if stored else count == top
-    if not whole:
+    if not (count >= top + blocks if stored else count == top):
         return
-    longest = int.from_bytes(record[70:72], "little")
-    runs = _runs(inspection, geometry, run_count, longest) if stored else None
-    if stored and runs is None:
-        return
+    runs = None
+    if stored and geometry is not None and "RUNS" in inspection.sections:
+        longest = int.from_bytes(record[70:72], "little")
+        runs = _runs(inspection, geometry, run_count, longest)
     nodes = _slots(inspection, top, blocks)
     parents = _parents(inspection, nodes)
     sound = _blocks(inspection, nodes)
     if runs is not None and parents is not None:
         sound = _leaves(inspection, nodes, parents, runs) and sound
-    sound = sound and (nodes.is_inner | nodes.is_leaf).any(axis=1).all()
-    if sound and parents is not None:
+    sound = sound and (runs is not None or not stored) and parents is not None
+    if geometry is not None and sound and (nodes.is_inner | nodes.is_leaf).any(axis=1).all():
         _boxes(inspection, nodes, geometry, runs)
 
 

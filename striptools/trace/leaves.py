@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int32
 
-from striptools.hierarchies.in_strip import BinaryTree, expand_hierarchy
+from striptools.hierarchies.in_strip import BinaryTree
+from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.wide import fill_leaf_blocks
-from striptools.partition.boxes import face_boxes
 from striptools.partition.object_split import split_objects
 from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
 
@@ -40,15 +40,14 @@ class Layout:
 
 
 def lay_out(scene: "Scene") -> Layout:
-    """Lay a scene out for the walk through its own hierarchy."""
-    faces = scene.faces()
-    tree = expand_hierarchy(scene.hierarchy, scene.starts, face_boxes(scene.positions, faces))
-    return lay_out_tree(scene, tree)
+    """Lay a scene out for the walk through its own hierarchy, the boxes made exact."""
+    wide = wide_tree(scene.with_boxes(), scene.triangle_boxes(), scene.block_starts)
+    return lay_out_wide(scene, wide, np.arange(scene.triangle_count, dtype=np.int32))
 
 
 def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
-    boxes = face_boxes(scene.positions, scene.faces())
+    boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
     tree = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size)
     return lay_out_tree(scene, tree, split.order)
@@ -62,11 +61,21 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree, order: Int32[np.ndarray, " n"
         tree: A leaf for each triangle.
         order: (n,) int32, the triangle in file order of each leaf; None where they are in file order.
     """
+    triangle = np.arange(scene.triangle_count, dtype=np.int32) if order is None else order
+    return lay_out_wide(scene, collapse(tree), triangle)
+
+
+def lay_out_wide(scene: "Scene", wide: WideTree, triangle: Int32[np.ndarray, " n"]) -> Layout:
+    """Lay a scene out for the walk through an eight-wide hierarchy over its triangles.
+
+    Args:
+        scene: Whose triangles they are.
+        wide: Its leaves are runs of places.
+        triangle: (n,) int32, the triangle in file order of each place.
+    """
     faces = scene.faces()
     ids, rotations = _names(scene, len(faces))
-    triangle = np.arange(len(faces), dtype=np.int32) if order is None else order
     faces, ids, rotations = faces[triangle], ids[triangle], rotations[triangle]
-    wide = collapse(tree)
     scale = scale_of(scene)
     leaves = len(wide.leaf_first)
     blocks = aligned_full((size_class(leaves), 10, WIDTH), np.nan)
