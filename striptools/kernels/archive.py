@@ -1,4 +1,4 @@
-"""Block data as an archive holds them (SPEC.md, section 6.2): the loops that take them apart and put them together.
+"""Block data as an archive holds them (SPEC.md, 6.2): the loops that take blocks apart and put them together.
 
 Both loops walk the strips in the same way and keep the same tables, so that what one guesses the other does.
 Numbers are the integers u of section 4.3, in the block's own units.
@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 from striptools.kernels.blocks import (
-    LOWEST,
     NEGATIVE_ZERO,
     axis_of,
     block_bits,
@@ -30,6 +29,9 @@ BEFORE = 1
 AFTER = 2
 STEP = 3
 """How a strip names a vertex."""
+
+NO_VALUE = 0x7FC00000
+"""What stands for the coordinate of a vertex that has none; nothing can refer to it."""
 
 NONE = 256
 """The row of a block's numbers that stays zero: what its first vertex is guessed from."""
@@ -65,6 +67,19 @@ def folded(difference, every):
 def unfolded(number, every):
     """The difference that a number stands for."""
     return every - (number >> 1) if number & 1 else number >> 1
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def take_axes(headers, block, modes, widths, every, anchors, exponents, scales):
+    """Read how the axes of a block are written: (3,) each, `every` the largest number."""
+    for axis in range(3):
+        mode, width, anchor, exponent = axis_of(headers, block, axis)
+        modes[axis] = mode
+        widths[axis] = width
+        every[axis] = (1 << width) - 1
+        anchors[axis] = anchor
+        exponents[axis] = exponent
+        scales[axis] = ldexp(1.0, exponent)
 
 
 @njit(cache=True, nogil=True)
@@ -115,6 +130,7 @@ def pack(headers, words, bits, vertex_starts, vertices, turns, starts, table, wa
     """
     after = np.empty(256, np.int64)
     before = np.empty(256, np.int64)
+    widths = np.empty(3, np.int64)
     numbers = np.zeros((257, 3), np.int64)
     firsts = np.empty(bits.shape[0], np.int32)
     step_count = known_count = distinct = strip = 0
@@ -125,11 +141,12 @@ def pack(headers, words, bits, vertex_starts, vertices, turns, starts, table, wa
         base = np.int64(vertex_starts[block])
         connectivity, _ = block_bits(headers, block)
         bit = (np.int64(headers[block, 1]) << 5) + connectivity
+        for axis in range(3):
+            widths[axis] = axis_of(headers, block, axis)[1]
         for k in range(np.int64(vertex_starts[block + 1]) - base):
             for axis in range(3):
-                width = axis_of(headers, block, axis)[1]
-                numbers[k, axis] = take(words, bit, width)
-                bit += width
+                numbers[k, axis] = take(words, bit, widths[axis])
+                bit += widths[axis]
         # Forget the edges of the block before.
         after[:] = -1
         before[:] = -1
@@ -180,7 +197,7 @@ def pack(headers, words, bits, vertex_starts, vertices, turns, starts, table, wa
                             i = a if corner == 1 else b if corner == 2 else i
                             j = h = i
                         for axis in range(3):
-                            every = (1 << axis_of(headers, block, axis)[1]) - 1
+                            every = (1 << widths[axis]) - 1
                             difference = numbers[w, axis] - guess(numbers, axis, i, j, h, every) & every
                             rest[axis, distinct] = folded(difference, every)
                         distinct += 1
@@ -198,9 +215,10 @@ def pack(headers, words, bits, vertex_starts, vertices, turns, starts, table, wa
 
 
 @njit(cache=True, nogil=True)
-def number_of(word, mode, width, anchor, exponent):
+def number_of(word, mode, every, anchor, exponent):
     """The number u that stands for the bits of a float32 on an axis, or -1 where there is none."""
-    every = (1 << width) - 1
+    if word & 0x7F800000 == 0x7F800000:
+        return -1
     if mode == 2:
         number = ordered(word) - anchor
     elif word == NEGATIVE_ZERO:
@@ -217,24 +235,22 @@ def number_of(word, mode, width, anchor, exponent):
     return number if 0 <= number <= every else -1
 
 
-@njit(cache=True, nogil=True)
-def put_value(number, mode, width, anchor, exponent, real, bits, row, axis):
-    """Write the float32 that a number u stands for on an axis; returns SOUND, or UNSOUND where there is none."""
-    if mode == 1 and number == (1 << width) - 1:
+@njit(cache=True, nogil=True, forceinline=True)
+def put_value(number, mode, every, anchor, scale, real, bits, row, axis):
+    """Write the float32 that a number u stands for on an axis, or what is none."""
+    bits[row, axis] = NO_VALUE
+    if mode == 1 and number == every:
         bits[row, axis] = NEGATIVE_ZERO
-        return SOUND
+        return
     number += anchor
     if mode == 2:
-        if number >= 0x7F800000 or number < -0x7F800000:
-            return UNSOUND
-        bits[row, axis] = number if number >= 0 else NEGATIVE_ZERO - 1 - number
-        return SOUND
-    exact = number * ldexp(1.0, exponent)
+        if -0x7F800000 <= number < 0x7F800000:
+            bits[row, axis] = number if number >= 0 else NEGATIVE_ZERO - 1 - number
+        return
+    exact = number * scale
     value = np.float32(exact)
-    if abs(number) > 0x7FFFFFFF or not np.isfinite(value) or np.float64(value) != exact:
-        return UNSOUND
-    real[row, axis] = value
-    return SOUND
+    if abs(number) <= 0x7FFFFFFF and np.isfinite(value) and np.float64(value) == exact:
+        real[row, axis] = value
 
 
 @njit(cache=True, nogil=True)
@@ -260,12 +276,19 @@ def unpack(headers, is_start, turns, flips, ways, known, steps, back, rest, real
     """
     after = np.empty(256, np.int64)
     before = np.empty(256, np.int64)
+    modes = np.empty(3, np.int64)
+    widths = np.empty(3, np.int64)
+    every = np.empty(3, np.int64)
+    anchors = np.empty(3, np.int64)
+    exponents = np.empty(3, np.int64)
+    scales = np.empty(3, np.float64)
     numbers = np.zeros((257, 3), np.int64)
     step_count = known_count = distinct = vertex = flip = place = 0
     last_place = 0
     a = b = c = 0
     for block in range(headers.shape[0]):
         count, vertex_count, strips, has_flips, index_width = block_counts(headers, block)
+        take_axes(headers, block, modes, widths, every, anchors, exponents, scales)
         begin = np.int64(headers[block, 0])
         bit = np.int64(headers[block, 1]) << 5
         index_bit = bit + (2 + has_flips) * count
@@ -306,7 +329,7 @@ def unpack(headers, is_start, turns, flips, ways, known, steps, back, rest, real
                 elif way == STEP:
                     w = largest - np.int64(steps[step_count])
                     step_count += 1
-                if w < 0 or w >= vertex_count or (corner == 0 and (way == BEFORE or way == AFTER)):
+                if w < 0 or w >= vertex_count or (corner == 0 and way in (BEFORE, AFTER)):
                     return UNSOUND, block
                 index_bit = put(words, index_bit, w, index_width)
                 if way == NEW:
@@ -328,19 +351,19 @@ def unpack(headers, is_start, turns, flips, ways, known, steps, back, rest, real
                         i = a if corner == 1 else b if corner == 2 else i
                         j = h = i
                     for axis in range(3):
-                        mode, width, anchor, exponent = axis_of(headers, block, axis)
-                        every = (1 << width) - 1
+                        mode, most, anchor = modes[axis], every[axis], anchors[axis]
                         if is_known:
-                            number = number_of(np.int64(bits[source, axis]), mode, width, anchor, exponent)
+                            number = number_of(
+                                np.int64(bits[source, axis]), mode, most, anchor, exponents[axis]
+                            )
                             if number < 0:
                                 return UNSOUND, block
                         else:
                             number = np.int64(rest[axis, distinct])
-                            if number > every:
+                            if number > most:
                                 return UNSOUND, block
-                            number = unfolded(number, every) + guess(numbers, axis, i, j, h, every) & every
-                            if put_value(number, mode, width, anchor, exponent, real, bits, distinct, axis):
-                                return UNSOUND, block
+                            number = unfolded(number, most) + guess(numbers, axis, i, j, h, most) & most
+                            put_value(number, mode, most, anchor, scales[axis], real, bits, distinct, axis)
                         numbers[w, axis] = number
                     if not is_known:
                         distinct += 1
@@ -359,6 +382,5 @@ def unpack(headers, is_start, turns, flips, ways, known, steps, back, rest, real
         # Write the numbers of the vertices.
         for k in range(vertex_count):
             for axis in range(3):
-                width = axis_of(headers, block, axis)[1]
-                index_bit = put(words, index_bit, numbers[k, axis], width)
+                index_bit = put(words, index_bit, numbers[k, axis], widths[axis])
     return SOUND, 0

@@ -21,7 +21,7 @@ from striptools.types import Words
 
 __all__ = ["LEVEL", "content_of", "expanded", "expanded_blocks", "from_content", "packed", "packed_blocks"]
 
-LEVEL = 12
+LEVEL = 9
 """Of Zstandard: half of the bytes hardly shrink at any level, and the rest gains little from a higher one."""
 
 
@@ -120,7 +120,7 @@ def content_of(blocks: Blocks, decoded: Decoded) -> bytes:
     )
     is_start = np.zeros(counts.triangles, np.bool_)
     is_start[decoded.starts[:-1]] = True
-    flips = np.zeros(0, np.bool_) if decoded.flips is None else decoded.flips[counts.flip_triangles(headers)]
+    flips = np.zeros(0, np.bool_) if decoded.flips is None else decoded.flips[counts.flip_triangles]
     ways.resize(-(-counts.corners // 4) * 4)
     quads = ways.reshape(-1, 4)
     parts = [
@@ -175,16 +175,10 @@ class _Counts:
         self.vertices = int((packed >> 8 & 0xFF).astype(np.int64).sum()) + len(headers)
         strips = int((packed >> 16 & 0xFF).astype(np.int64).sum()) + len(headers)
         self.corners = self.triangles + 2 * strips
-        self.flips = int(triangles[self.with_flips(headers)].sum())
-
-    @staticmethod
-    def with_flips(headers: np.ndarray) -> np.ndarray:
-        """Which blocks have flip bits, (b,) bool."""
-        return (headers[:, 2] >> 24 & layout.BLOCK_FLIPS).astype(np.bool_)
-
-    def flip_triangles(self, headers: np.ndarray) -> np.ndarray:
-        """Which triangles have flip bits, (n,) bool."""
-        return np.repeat(self.with_flips(headers), (headers[:, 2] & 0xFF).astype(np.int64) + 1)
+        # A block with flip bits has one for each of its triangles.
+        with_flips = (packed >> 24 & layout.BLOCK_FLIPS).astype(np.bool_)
+        self.flips = int(triangles[with_flips].sum())
+        self.flip_triangles = np.repeat(with_flips, triangles)
 
     @property
     def most_bytes(self) -> int:

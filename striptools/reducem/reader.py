@@ -216,7 +216,7 @@ class _File:
             raw = expanded_blocks(payload, *given).astype("<u4", copy=False).view(np.uint8)
         else:
             raw = expanded(payload, entry.codec, entry.kind, entry.raw_length, place)
-        if zlib.crc32(raw) != entry.raw_checksum:
+        if zlib.crc32(raw.data) != entry.raw_checksum:
             raise unreadable("RDM122", place)
         return raw
 

@@ -41,7 +41,7 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
     Args:
         scene: The scene; every rule of the format is checked first.
         target: A path, written whole or not at all, or a binary stream.
-        archive: Pack every section but the scene record, by the codec of its kind, where that makes it smaller.
+        archive: Pack every section but the scene record where that makes it smaller.
 
     Returns:
         Bytes written.
@@ -53,7 +53,9 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
         WriteError: The file could not be written whole.
     """
     check_scene(scene)
-    sections = [_stored(scene, section, payload, archive) for section, payload in _payloads(scene) if len(payload)]
+    sections = [
+        _stored(scene, section, payload, archive) for section, payload in _payloads(scene) if len(payload)
+    ]
 
     def write(file: IO[bytes]) -> None:
         for chunk in _chunks(sections):
