@@ -57,9 +57,7 @@ def describe(scene: Scene) -> dict[str, object]:
         "remap": scene.remap is not None,
         "source_faces": scene.source_face_count,
         "bounds": {"lowest": scene.low.tolist(), "highest": scene.high.tolist()},
-        "metadata": {
-            _printable(name): _printable(str(value)) for name, value in scene.metadata.items()
-        },
+        "metadata": {_printable(name): _printable(str(value)) for name, value in scene.metadata.items()},
     }
 
 
