@@ -101,6 +101,8 @@ def expanded_blocks(
     blocks = Blocks(headers, np.zeros(raw_length // 4, np.uint32))
     check_headers(blocks, triangle_count, where)
     counts = _Counts(headers)
+    if not counts.all_used:
+        raise unreadable("RDM613", place)
     content = _decompressed(stored, None, counts.most_bytes, place)
     from_content(content, blocks, place)
     return blocks.words
@@ -170,11 +172,10 @@ class _Counts:
 
     def __init__(self, headers: np.ndarray) -> None:
         packed = headers[:, 2]
-        triangles = (packed & 0xFF).astype(np.int64) + 1
-        self.triangles = int(triangles.sum())
-        self.vertices = int((packed >> 8 & 0xFF).astype(np.int64).sum()) + len(headers)
-        strips = int((packed >> 16 & 0xFF).astype(np.int64).sum()) + len(headers)
-        self.corners = self.triangles + 2 * strips
+        triangles, vertices, strips = ((packed >> shift & 0xFF).astype(np.int64) + 1 for shift in (0, 8, 16))
+        self.triangles, self.vertices = int(triangles.sum()), int(vertices.sum())
+        self.corners = self.triangles + 2 * int(strips.sum())
+        self.all_used = bool((vertices <= triangles + 2 * strips).all())
         # A block with flip bits has one for each of its triangles.
         with_flips = (packed >> 24 & layout.BLOCK_FLIPS).astype(np.bool_)
         self.flips = int(triangles[with_flips].sum())

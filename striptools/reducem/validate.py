@@ -192,7 +192,7 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
         return False
     lengths = _lengths(*struct.unpack_from("<5I", payload), payload[24] & 1)
     # Block data may lean on the headers, wherever those lie.
-    for kind, entry in sorted(first.items(), key=lambda item: item[0] == "BLKD"):
+    for kind, entry in sorted(first.items(), key=lambda item: item[1].codec == 2):
         _decode(inspection, entry, lengths[kind])
     for kind, (least, _) in lengths.items():
         if least and kind not in first and kind not in ("RMAP", "META"):
@@ -261,6 +261,8 @@ def _sound_headers(inspection: Inspection, entry: _Entry) -> Blocks | None:
         return None
     nothing = Section(entry.kind, entry.offset, entry.codec, bytes(entry.raw_length))
     blocks = inspect_headers(inspection, headers, nothing)
+    if int(blocks.k.sum()) != int.from_bytes(inspection.sections["SCEN"].data[:4], "little"):
+        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
     return blocks if len(inspection.findings) == found else None
 
 
