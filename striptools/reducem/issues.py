@@ -83,6 +83,8 @@ _ALL = (
     _flaw("RDM122", "3.2", "the checksum of a section's decoded bytes does not fit", _DAMAGED),
     _word("RDM123", "6", "a section is passed over: its codec is not installed", "install the extra archive"),
     _flaw("RDM124", "8", "the scene is larger than this program can hold", "split the model"),
+    _flaw("RDM125", "6", "the codec of a section is not one for its kind"),
+    _flaw("RDM126", "6.2", "the streams of packed block data do not fit the block headers", _DAMAGED),
     _flaw("RDM201", "4.1", "a count is out of its range, or disagrees with another one"),
     _flaw("RDM202", "4.1", "the error bound is negative or not finite"),
     _flaw("RDM203", "4.1", "the grid exponent is out of its range, or there without a grid"),

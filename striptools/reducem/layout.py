@@ -15,6 +15,8 @@ MUST_UNDERSTAND = 1
 
 CODEC_RAW = 0
 CODEC_ZSTD = 1
+CODEC_BLOCKS = 2
+CODEC_PLANES = 3
 LARGEST_WINDOW = 27
 """Two to this many bytes is the largest window of a Zstandard frame."""
 
@@ -204,6 +206,19 @@ MATERIALS = Section(b"MATL", False)
 METADATA = Section(b"META", False)
 SECTIONS = (SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, ATTRIBUTES, MATERIALS, METADATA)
 """In the order in which the writer puts them."""
+
+PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 2, REMAP.kind: 4}
+"""Bytes of a record for the kinds of sections that may have the codec of planes."""
+
+
+def codecs_of(section: Section) -> tuple[int, ...]:
+    """The codecs that a section may have."""
+    if section is SCENE:
+        return (CODEC_RAW,)
+    if section is BLOCK_DATA:
+        return (CODEC_RAW, CODEC_ZSTD, CODEC_BLOCKS)
+    return (CODEC_RAW, CODEC_ZSTD) + ((CODEC_PLANES,) if section.kind in PLANE_WIDTHS else ())
+
 
 PARTS = (
     "positions",

@@ -447,9 +447,7 @@ def _walk_group(
         nodes_then_leaves,
         (_State(places, stacks, zero, steps), bests),
     )
-    results = [
-        _result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)
-    ]
+    results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
     t, name = (jnp.stack([r[k] for r in results]) for k in range(2))
     counted = jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0))
     return state.stacks, _Walked(t, name, counted)

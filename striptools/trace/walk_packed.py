@@ -199,7 +199,10 @@ class PackedScene(NamedTuple):
         place, shift = bits >> 5, bits & 31
         lower, upper = loaded[0], loaded[1]
         for k in range(1, count - 1):
-            lower, upper = jnp.where(place == k, loaded[k], lower), jnp.where(place == k, loaded[k + 1], upper)
+            lower, upper = (
+                jnp.where(place == k, loaded[k], lower),
+                jnp.where(place == k, loaded[k + 1], upper),
+            )
         return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
@@ -321,9 +324,7 @@ def _at(values: Array, places: Array) -> Array:
 
 def _rows_at(values: Array, places: Array, count: int) -> list[Array]:
     """Values at places, at the places behind them, and so on: one gather, which costs as much as one of them."""
-    dimensions = lax.GatherDimensionNumbers(
-        offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,)
-    )
+    dimensions = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,))
     inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
     rows = lax.gather(values, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
     return [rows[k] for k in range(count)]
