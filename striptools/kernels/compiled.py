@@ -2,8 +2,9 @@
 
 All keep the compiled code beside the source's cache, and let other Python threads run. Wrappers that nobody
 calls cost a good part of the time of compiling a small function, so only a `kernel` has one. Counting
-references costs two atomic additions for each array of a named tuple and call, which made up most of the time
-of the search for tunnels: a `helper` counts none, and in return may neither make arrays nor return one.
+references costs two atomic additions for each array of a named tuple and call, which were the hottest
+instructions of the search for tunnels: a `helper` counts none, and in return may neither make arrays nor
+return one.
 """
 
 from typing import Any

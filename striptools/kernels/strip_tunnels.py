@@ -2,10 +2,10 @@
 
 Faces of a range are numbered by their place in it. A *strip* is a row of faces, kept in an arena `rows`;
 rows of changed strips go to the arena's top. While a chain is tried nothing is written there: a *virtual row*
-is a list of pieces of the arena, each run forwards or backwards. A strip's *end* is
-the last face of its row, its *head* the first. A *rotation* links the end t of strip a to an inner face u of
-strip b and cuts one of u's links; the part of b on the far side of the cut leaves b for a, and the face w
-at the near side is the new end. Within one strip (a = b) the cut must face t, or a ring would close.
+is a list of pieces of the arena, each run forwards or backwards. A strip's *end* is the last face of its row,
+its *head* the first. A *rotation* links the end t of strip a to an inner face u of strip b and cuts one of
+u's links; the part of b on the far side of the cut leaves b for a, and the face w at the near side is the
+new end. Within one strip (a = b) the cut must face t, or a ring would close.
 
 Boxes are (n, 6) float32: minus the low corner, then the high corner, so that a union is six maxima; they are
 scaled by a power of two to lie within -1 and 1, so that no area overflows float32 and no box is rounded.
