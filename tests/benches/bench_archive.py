@@ -4,8 +4,8 @@
 
 A MODEL is a mesh file. It is converted without a remap, lossless and on a grid of 16 bits, and saved raw and
 as an archive; what the archive expands to is compared with the raw file, byte for byte. The peers get the
-same faces in the source's order: meshoptimizer orders them by its vertex cache and applies its index and
-vertex codecs at their best level, then Zstandard; Draco has the same number of bits, and 24, which loses
+same faces in the source's order: meshoptimizer orders them by its vertex cache for strips, which packs
+best, and applies its index and vertex codecs at their best level, then Zstandard; Draco has the same number of bits, and 24, which loses
 some, beside lossless ones. Both hold geometry alone: a hierarchy has to be built anew from what they give
 back. A peer that is not installed (extra `peers`) is left out with a word.
 
@@ -167,12 +167,12 @@ def on_grid(scene: Scene, positions: np.ndarray) -> np.ndarray | None:
 
 
 def by_meshoptimizer(library, zstandard, vertices: np.ndarray, faces: np.ndarray, level: int) -> Outcome:
-    """Order by vertex cache, vertices by first use; index codec, vertex codec, Zstandard."""
+    """Order by vertex cache for strips, vertices by first use; index codec, vertex codec, Zstandard."""
     count, indices = len(vertices), faces.size
 
     def encode() -> tuple[bytes, int, int]:
         order = np.zeros(indices, np.uint32)
-        library.optimize_vertex_cache(order, faces.reshape(-1), indices, count)
+        library.optimize_vertex_cache_strip(order, faces.reshape(-1), indices, count)
         place = np.zeros(count, np.uint32)
         library.optimize_vertex_fetch_remap(place, order, indices, count)
         moved = np.zeros_like(vertices)
