@@ -70,7 +70,14 @@ class PackedLayout:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
         headers = arrays.headers[: self.blocks]
-        kept = (headers, arrays.words, arrays.faces, self.rotations, arrays.frame.scale, int(arrays.scale_exponent))
+        kept = (
+            headers,
+            arrays.words,
+            arrays.faces,
+            self.rotations,
+            arrays.frame.scale,
+            int(arrays.scale_exponent),
+        )
         kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], *kept, *found)
 
 

@@ -69,7 +69,7 @@ class Frame(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The closest hit of all, or t_max, and the closest in each lane: (8,), `name` what the scene calls it."""
+    """The closest hit of all, or t_max, and that in each lane, (8,): `name` is what the scene calls it."""
 
     nearest: Array
     t: Array
@@ -150,7 +150,7 @@ class Decode(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """One entry a ray; what was not asked for has no entries. `name` is what the scene calls the triangle hit."""
+    """One entry a ray; what was not asked for has none. `name` is what the scene calls the triangle hit."""
 
     t: Array
     name: Array
@@ -447,9 +447,7 @@ def _walk_group(
         nodes_then_leaves,
         (_State(places, stacks, zero, steps), bests),
     )
-    results = [
-        _result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)
-    ]
+    results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
     t, name = (jnp.stack([r[k] for r in results]) for k in range(2))
     counted = jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0))
     return state.stacks, _Walked(t, name, counted)
