@@ -190,7 +190,7 @@ class PackedScene(NamedTuple):
         before = self._windows(word, indices + (place - (run >> 27)) * width, jnp.uint32(0), 2)
         far = jnp.where(other == 0, before, far) & mask
         if flips:
-            flipped = self._windows(word, 2 * triangles + first, lane, 2) & has_flips
+            flipped = self._windows(word, 2 * triangles + first, lane, 3) & has_flips
             turned = turned ^ (flipped != 0)
         newest, near = near >> width & mask, near & mask
         return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
