@@ -10,7 +10,7 @@ from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_cor
 
 @kernel
 def mark_leaves(words, records, top_count):
-    """Write to bits 24 to 31 of the word `leaves` of the nodes over blocks which of their slots are leaves."""
+    """Write to bits 24 to 31 of the word `leaves` of nodes over blocks which of their slots are leaves."""
     for node in range(top_count):
         leaves = np.int64(0)
         for slot in range(WIDTH):
@@ -79,9 +79,9 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
         runs: (r,) uint16.
         begin: The first block.
         end: Where they end.
-        described: (r,) uint32, written. Bits 0 to 7: the first triangle; 8 to 10: triangles, less one; 11 to
-            18: the strip, counted in the block; 19 to 26: turns; 27 to 31: p + 1 - k is the far corner's place
-            for the first triangle, this is k.
+        described: (r,) uint32, written. Bits 0 to 7: the first triangle; 8 to 10: triangles, less one; 11
+            to 18: the strip, counted in the block; 19 to 26: turns; 27 to 31: k, where p + 1 - k is the far
+            corner's place for the first triangle.
     """
     strip_of = np.empty(256, np.int64)
     start_of = np.empty(256, np.int64)

@@ -28,7 +28,7 @@ class Layout(Protocol):
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
-        """(>= 6, 8) float32 boxes of the root's children, NaN where there is none, and (8,) int32 children."""
+        """(>= 6, 8) float32 boxes of the root's children, NaN where is none, and (8,) int32 children."""
         ...
 
     @property

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 EXPANDED_BYTES = 90
-"""What an expanded scene takes a triangle at most, about: 320 bytes a leaf, 224 a node, 12 a face, and the size
-classes."""
+"""What an expanded scene takes a triangle, about: 320 bytes a leaf, 224 a node, 12 a face, and size classes.
+Scenes of lone triangles take more."""
 
 
 def free_memory(device: Any) -> int:

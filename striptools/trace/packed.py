@@ -131,7 +131,9 @@ def decode_of(blocks: "Blocks", scale_exponent: int) -> Decode:
     headers = blocks.headers
     mode, width = blocks.axes()
     exponents = np.stack([headers[:, 6] >> 24, headers[:, 7] & 0xFF, headers[:, 7] >> 8 & 0xFF], axis=1)
-    least = int(np.where(mode == 2, 0, exponents.astype(np.int64) - 149).min())
+    # An axis of nothing but zeros has the least exponent there is.
+    zero = (headers[:, 3:6] == 0) & (width <= mode)
+    least = int(np.where((mode == 2) | zero, 0, exponents.astype(np.int64) - 149).min())
     least = min(least, int(kernels.least_exponent(headers, blocks.words)))
     return Decode(
         words=max(1, (int(width.sum(axis=1).max()) + 31 + 31) // 32),

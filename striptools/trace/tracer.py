@@ -47,7 +47,8 @@ class Tracer:
         device: "auto" takes a GPU where JAX has one.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
-            triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the same.
+            triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
+            same.
         resident: "expanded" keeps boxes and corners as float32, 80 bytes a triangle; "compressed" keeps the
             blocks as they are, a tenth of that, and decodes triangles where they are tested, which is
             slower. Hits are the same. "auto" expands what fits in `memory_budget`.
@@ -55,7 +56,7 @@ class Tracer:
             that is free on the device, or on this machine where the device does not tell.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or no rebuilt hierarchy that is compressed.
+        UsageError: There is no such device, hierarchy or residency, or not both of them together.
     """
 
     def __init__(

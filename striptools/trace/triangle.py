@@ -77,7 +77,7 @@ def shear_of(origin: Array, direction: Array) -> Shear:
     )
 
 
-def pick(vector: Array, axis: Array) -> Array:
+def pick(vector: Array | tuple[Array, Array, Array], axis: Array) -> Array:
     """The coordinate of a (3,) vector along an axis."""
     return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
@@ -121,7 +121,7 @@ def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
 
 
 def _summed(a: Array, b: Array, c: Array, turn: Array | None) -> Array:
-    """The sum in the canonical order: all that turning a triangle's corners changes, since it turns edges too.
+    """The sum in the canonical order: all that turning a triangle's corners changes; edges turn with them.
 
     Edges a, b, c of corners (a, b, c) are edges c, a, b of (b, c, a), bit for bit.
     """

@@ -69,7 +69,7 @@ class Frame(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The closest hit of all, or t_max, and the closest in each lane: (8,), `name` what the scene calls it."""
+    """The closest hit of all, or t_max, and that in each lane, (8,): `name` is what the scene calls it."""
 
     nearest: Array
     t: Array
@@ -150,7 +150,7 @@ class Decode(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """One entry a ray; what was not asked for has no entries. `name` is what the scene calls the triangle hit."""
+    """One entry a ray; what was not asked for has none. `name` is what the scene calls the triangle hit."""
 
     t: Array
     name: Array

@@ -1,4 +1,4 @@
-"""A scene of packed blocks, as the walk sees it: nodes, headers, bit streams and runs as a scene file has them.
+"""A scene of packed blocks, as the walk sees it: nodes, headers and bit streams as a scene file has them.
 
 Nodes follow Ylitie, Karras & Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs"
 (HPG 2017), leaves Lauterbach et al., ReduceM (EGSR 2008): a leaf is up to eight triangles of a strip, decoded
@@ -7,12 +7,16 @@ same corners, scaled by the same power of two, in the same test.
 
 Differences:
 
-1. A leaf is named by its node and slot, and its run is counted when it is visited.
+1. A leaf is named by its node and slot, and its run is counted when it is visited. A run is a word of 4
+   bytes (`kernels.packed_hits.describe_runs`) in the place of the file's 2: beside its triangles it says
+   where their corners are in the strip, which saves reading start and turn bits.
 2. What no block of the scene needs is not compiled in (`walk.Decode`).
 3. Corners are not put in the canonical order; only the sums are made in it (`triangle.crossing_of`).
+4. Lanes hold triangles, not faces: the remap is read where two hits have the same t, and nowhere else.
 
-**Boxes.** With L the grid's low and c its cell on an axis, scaled, a plane K = origin + (q << shift) is at L +
-cK exactly. Of a ray at o with (rounded) inverse direction v the distance to it, with margin m, is computed as
+**Boxes.** With L the grid's low and c its cell on an axis, scaled, a plane K = origin + (q << shift) is at
+L + cK exactly. Of a ray at o with (rounded) inverse direction v the distance to it, with margin m, is
+computed as
 
     q * (cv << shift) + (origin * cv - ((o + m) - L) * v),   cv exact, c and << shift powers of two.
 
@@ -20,8 +24,8 @@ In units of position, with u = 2^-24 and M the largest of |o| and the scene's co
 taking L away and multiplying by v moves it by at most u (M + 2 * 2M); the product and the sum with origin by
 u (2M + 2M), half of it where they are fused; the product with q by u 2M, none of it where fused. The last sum
 is relative to the distance itself, which `box.FAR_FACTOR` allows for. That is 11 uM, and the triangle test
-needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that would be denormal counts as zero: its planes
-move by less than 2^-100.
+needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that would be denormal counts
+as zero: its planes move by less than 2^-100.
 """
 
 from itertools import pairwise
@@ -32,8 +36,8 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
-from striptools.trace.numerics import folded, index, larger
-from striptools.trace.triangle import Shear, crossing_of, edges_of, pick
+from striptools.trace.numerics import folded, index
+from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
 from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
 
 MARGIN = np.float32(2.0**-19)
@@ -125,8 +129,8 @@ class PackedScene(NamedTuple):
         corners = self._corners(header, run, options.decode.flips)
         x, y, z = self._positions(header, corners, options.decode)
         turn = _first_corner(x, y, z)
-        along = [tuple(pick(triple, axis) for triple in zip(x, y, z, strict=True)) for axis in shear.axes]
-        t = crossing_of(edges_of(*along, shear), turn)
+        ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
+        t = crossing_of(edges_of(ax, ay, az, shear), turn)
         t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
         triangle = (first + lane).astype(jnp.int32)
         found = _any((t > 0) & (t <= best.t))
@@ -186,7 +190,7 @@ class PackedScene(NamedTuple):
         before = self._windows(word, indices + (place - (run >> 27)) * width, jnp.uint32(0), 2)
         far = jnp.where(other == 0, before, far) & mask
         if flips:
-            flipped = self._windows(word, 2 * triangles + first, lane, 2) & has_flips
+            flipped = self._windows(word, 2 * triangles + first, lane, 3) & has_flips
             turned = turned ^ (flipped != 0)
         newest, near = near >> width & mask, near & mask
         return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
@@ -291,8 +295,14 @@ def _scaled(number: Array, exponent: Array) -> Array:
     return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, jnp.float32(0), value)
 
 
+def _along(x: list[Array], y: list[Array], z: list[Array], axis: Array) -> Corners:
+    """The coordinates along an axis of corners a, b, c."""
+    a, b, c = (pick(corner, axis) for corner in zip(x, y, z, strict=True))
+    return a, b, c
+
+
 def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
-    """Which corner is the least by (x, y, z), the first of equals, as `kernels.wide.fill_leaf_blocks` has it."""
+    """Which corner is the least by (x, y, z), the first of equals: as `kernels.wide.first_corner` has it."""
 
     def before(i: int, j: int) -> Array:
         tail = (y[i] < y[j]) | ((y[i] == y[j]) & (z[i] < z[j]))
@@ -323,7 +333,7 @@ def _at(values: Array, places: Array) -> Array:
 
 
 def _rows_at(values: Array, places: Array, count: int) -> list[Array]:
-    """Values at places, at the places behind them, and so on: one gather, which costs as much as one of them."""
+    """Values at places, at the places behind them, and so on: one gather, which is cheaper than several."""
     dimensions = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,))
     inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
     rows = lax.gather(values, places[:, None], dimensions, slice_sizes=(count,), mode=inside)

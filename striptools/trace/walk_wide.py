@@ -58,7 +58,8 @@ class WideScene(NamedTuple):
             rows = lax.dynamic_slice(self.blocks, (leaf, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
             return rows[0], rows[1], rows[2]
 
-        t = crossing_of(edges_of(*(corners(axis) for axis in shear.axes), shear))
+        x, y, z = (corners(axis) for axis in shear.axes)
+        t = crossing_of(edges_of(x, y, z, shear))
         bits = lax.dynamic_slice(self.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
         face = lax.bitcast_convert_type(bits, jnp.int32)
         closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))

@@ -1,0 +1,300 @@
+"""Packed blocks traced as they lie: the hits of the expanded walk, bit for bit, wherever rays come from."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rays import aimed_rays
+from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
+
+import striptools
+from striptools.errors import UsageError
+from striptools.kernels.rays import ROW
+from striptools.mesh.clean import clean
+from striptools.mesh.mesh import Mesh
+from striptools.pipeline import Options
+from striptools.reducem.scene import empty_scene
+from striptools.strips.ordering import OrderingOptions
+from striptools.trace import Tracer
+from striptools.trace import walk_packed as walk
+from striptools.trace.box import slab_of
+from striptools.trace.launch import program
+from striptools.trace.packed import lay_out_packed
+from striptools.trace.walk import DONE, Decode
+
+FIELDS = ("t", "face", "u", "v", "triangle")
+
+
+def scene_of(mesh, *, remap=True, max_length=64, block=256):
+    ordering = OrderingOptions(max_length=max_length, block=block)
+    return striptools.convert(mesh, Options(ordering=ordering, remap=remap, threads=1))
+
+
+def both(scene, **options):
+    kinds = ("expanded", "compressed")
+    return [Tracer(scene, device="cpu", threads=1, resident=kind, **options) for kind in kinds]
+
+
+def assert_same(scene, origins, directions, t_max=None):
+    """Every field of every ray is the same, and any hit is the same as whether there is a closest one."""
+    expanded, compressed = both(scene)
+    one = expanded.closest_hit(origins, directions, t_max=t_max)
+    two = compressed.closest_hit(origins, directions, t_max=t_max)
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(one, field), getattr(two, field), err_msg=field)
+    np.testing.assert_array_equal(compressed.any_hit(origins, directions, t_max=t_max), two.hit)
+    return two
+
+
+def rays_at(scene, count, seed):
+    return aimed_rays(scene.positions, scene.faces(), count, seed)
+
+
+@settings(max_examples=12)
+@given(
+    clean_meshes(),
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
+    st.sampled_from([1, 3, 64]),
+    st.sampled_from([16, 256]),
+)
+def test_any_mesh_has_the_same_hits(mesh, seed, remap, max_length, block):
+    scene = scene_of(mesh, remap=remap, max_length=max_length, block=block)
+    assert_same(scene, *rays_at(scene, 60, seed))
+
+
+SHAPES = {
+    "one triangle": (np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.int32([[0, 1, 2]])),
+    "planar": grid(20, 20),
+    "fan": fan(300),
+    "pages on an edge": book(26),
+    "soup": soup(600, 1, 1000),
+    "coincident soup": soup(300, 2, 3),
+    "copies": stack(40),
+    "cube": cube(),
+    "closed": sphere(4),
+    "tangle": tangle(12, 80, 3),
+    "thin": (sphere(3)[0] * np.float32([1, 1e-6, 1]), sphere(3)[1]),
+}
+
+
+@pytest.mark.parametrize(("shape", "remap"), [(name, k % 2 == 0) for k, name in enumerate(SHAPES)])
+def test_shapes_have_the_same_hits(shape, remap):
+    mesh = clean(Mesh(*SHAPES[shape])).mesh
+    scene = scene_of(mesh, remap=remap)
+    hits = assert_same(scene, *rays_at(scene, 600, 5))
+    assert hits.hit.sum() > 50
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(2.0**-140, 0), (2.0**-120, 1), (1e-8, 0), (1, 1e4), (2.0**120, 0), (2.0**100, 1e4)]
+)
+def test_units_and_offsets_have_the_same_hits(scale, offset):
+    positions, faces = sphere(3)
+    moved = ((positions.astype(np.float64) + offset) * scale).astype(np.float32)
+    scene = scene_of(clean(Mesh(moved, faces)).mesh)
+    assert_same(scene, *rays_at(scene, 400, 7))
+
+
+def test_every_mode_of_coordinates_has_the_same_hits():
+    """Coordinates of all magnitudes at once, -0.0 and denormals among them: modes 0, 1 and 2."""
+    random = np.random.default_rng(3)
+    positions, faces = soup(400, 1, 1000)
+    positions = positions / np.float32(1000)
+    positions[::3] *= np.float32(10.0) ** random.integers(-42, 1, (len(positions[::3]), 3)).astype(np.float32)
+    positions[random.random(positions.shape) < 0.05] = -0.0
+    mesh = clean(Mesh(positions, faces)).mesh
+    for unit in (1.0, 2.0**-100, 2.0**60):
+        scene = scene_of(Mesh(mesh.positions * np.float32(unit), mesh.faces))
+        assert lay_out_packed(scene).decode.as_bits
+        assert_same(scene, *rays_at(scene, 400, 8))
+    lattice = scene_of(Mesh(*clean_lattice()))
+    assert lay_out_packed(lattice).decode == Decode(2, True, False, False, False)
+    assert_same(lattice, *rays_at(lattice, 400, 9))
+
+
+def clean_lattice():
+    positions, faces = grid(6, 6)
+    positions[:, 0] = np.where(positions[:, 0] == 0, -0.0, positions[:, 0])
+    mesh = clean(Mesh(positions, faces)).mesh
+    return mesh.positions, mesh.faces
+
+
+def test_flips_are_followed():
+    random = np.random.default_rng(4)
+    positions, faces = sphere(3)
+    faces = np.where((random.random(len(faces)) < 0.4)[:, None], faces[:, ::-1], faces)
+    scene = scene_of(Mesh(positions, np.ascontiguousarray(faces)))
+    assert lay_out_packed(scene).decode.flips == (scene.flips is not None)
+    assert_same(scene, *rays_at(scene, 600, 5))
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return scene_of(Mesh(*sphere(5)))
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e4, 1e6])
+def test_far_origins_have_the_same_hits(ball, distance):
+    random = np.random.default_rng(5)
+    towards = random.normal(size=(3000, 3))
+    origins = (towards / np.linalg.norm(towards, axis=1, keepdims=True) * distance).astype(np.float32)
+    targets = ball.positions[random.integers(0, len(ball.positions), len(origins))]
+    hits = assert_same(ball, origins, (targets - origins).astype(np.float32))
+    assert hits.hit.mean() > 0.3
+
+
+def test_limits_of_t_are_the_same(ball):
+    origins, directions = rays_at(ball, 2000, 6)
+    assert_same(ball, origins, directions, t_max=np.float32(1))
+    assert_same(ball, origins, directions, t_max=np.linspace(0, 2, len(origins)).astype(np.float32))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_rays_along_axes_in_the_planes_of_boxes(axis):
+    scene = scene_of(clean(Mesh(*cube())).mesh)
+    lattice = np.array([[i, j] for i in (0, 0.25, 0.5, 1) for j in (0, 0.25, 0.5, 1)], np.float32)
+    for sign in (1.0, -1.0):
+        origins = np.full((len(lattice), 3), -5.0 * sign, np.float32)
+        origins[:, [k for k in range(3) if k != axis]] = lattice
+        directions = np.zeros_like(origins)
+        directions[:, axis] = sign
+        assert assert_same(scene, origins, directions).hit.all()
+
+
+def test_no_ray_leaves_a_closed_sphere(ball):
+    positions, faces = ball.positions, ball.faces()
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    targets = np.concatenate([positions[edges].astype(np.float64).mean(axis=1), positions])
+    origin = np.float32([0.1, -0.2, 0.15])
+    directions = (targets - origin).astype(np.float32)
+    assert assert_same(ball, np.broadcast_to(origin, directions.shape), directions).hit.all()
+
+
+def test_real_models_have_the_same_hits(real_mesh):
+    for name in ("chandelier", "tree_japanesemaple"):
+        scene = striptools.convert(real_mesh(name))
+        assert_same(scene, *rays_at(scene, 3000, 11))
+
+
+# ---- Boxes.
+
+
+def boxes_met(scene, origin, direction):
+    """Which slots' boxes the walk enters of all nodes, (m, 8) bool, and the boxes' exact scaled sides."""
+    layout = lay_out_packed(scene)
+    arrays = layout.arrays
+    count = len(scene.with_boxes().nodes)
+    slab = slab_of(jnp.asarray(origin), jnp.asarray(direction), arrays.frame)
+    scene_on_device = type(arrays)(*(jnp.asarray(a) for a in arrays[:-1]), arrays.frame)
+    met = [scene_on_device.lanes_met(jnp.int32(k), slab, jnp.float32(np.inf)) for k in range(count)]
+    record = arrays.planes[:count]
+    nodes = arrays.nodes[:count].astype(np.int64)
+    start = np.stack([nodes[:, 2] & 0xFFFF, nodes[:, 2] >> 16, nodes[:, 3] & 0xFFFF], axis=1)
+    shift = np.stack([nodes[:, 0] >> 28, nodes[:, 3] >> 24 & 15, nodes[:, 3] >> 28], axis=1)
+    planes = record[:, 16:].reshape(-1, 2, 3, 8).astype(np.int64)
+    cells = start[:, None, :, None] + (planes << shift[:, None, :, None])
+    frame = arrays.frame
+    sides = frame.low.astype(np.float64)[:, None] + cells * frame.unit.astype(np.float64)[:, None]
+    return np.array(met), sides, planes[:, 0, 0] > planes[:, 1, 0], float(frame.scale)
+
+
+@pytest.mark.parametrize("far", [1.0, 300.0, 1e5])
+def test_no_box_is_missed_that_the_exact_ray_meets(far):
+    scene = scene_of(Mesh(*sphere(2)), block=16)
+    random = np.random.default_rng(int(far))
+    wrongly = 0
+    for _ in range(12):
+        target = scene.positions[random.integers(len(scene.positions))]
+        origin = (target + far * random.normal(size=3)).astype(np.float32)
+        if random.random() < 0.5:
+            origin[random.integers(3)] = target[random.integers(3)]
+        direction = (target - origin).astype(np.float32)
+        direction /= np.float32(2.0) ** np.floor(np.log2(np.abs(direction).max()))
+        met, sides, empty, scale = boxes_met(scene, origin, direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (sides - (origin.astype(np.float64) * scale)[:, None]) / direction.astype(np.float64)[:, None]
+        inside = ((origin * scale)[:, None] >= sides[:, 0]) & ((origin * scale)[:, None] <= sides[:, 1])
+        still = (direction == 0)[:, None]
+        low = np.where(still, np.where(inside, -np.inf, np.inf), t.min(axis=1)).max(axis=1)
+        high = np.where(still, np.where(inside, np.inf, -np.inf), t.max(axis=1)).min(axis=1)
+        exact = (np.maximum(low, 0) <= high) & ~empty
+        assert not (exact & ~met).any()
+        assert not (met & empty).any()
+        wrongly += int((met & ~exact).sum())
+    assert wrongly < 3000
+
+
+# ---- What is asked, and how.
+
+
+def test_memory_decides_what_auto_is(ball):
+    count = ball.triangle_count
+    small, large = (Tracer(ball, device="cpu", memory_budget=k * count) for k in (20, 200))
+    assert (small.resident, large.resident) == ("compressed", "expanded")
+    assert small.resident_bytes < large.resident_bytes / 3
+    assert Tracer(ball, device="cpu").resident == "expanded"
+
+
+def test_wrong_kinds_are_told(ball):
+    with pytest.raises(UsageError, match="no such residency"):
+        Tracer(ball, device="cpu", resident="packed")
+    with pytest.raises(UsageError, match="rebuilt hierarchy is expanded"):
+        Tracer(ball, device="cpu", resident="compressed", hierarchy="rebuilt")
+
+
+def test_nothing_is_hit_in_an_empty_scene():
+    for tracer in both(empty_scene()):
+        hits = tracer.closest_hit(np.zeros((3, 3)), np.ones((3, 3)))
+        assert not hits.hit.any()
+        assert not tracer.any_hit(np.zeros((3, 3)), np.ones((3, 3))).any()
+
+
+def test_steps_are_counted_alike(ball):
+    origins, directions = rays_at(ball, 500, 12)
+    one, two = (tracer.closest_hit(origins, directions, steps=True).steps for tracer in both(ball))
+    assert (two[two > 0] >= 1).all()
+    assert abs(int(two.sum()) - int(one.sum())) < 0.2 * one.sum()
+
+
+def test_all_rays_at_once_have_the_same_hits(ball):
+    """The GPU's way of walking, on a CPU."""
+    origins, directions = rays_at(ball, 200, 13)
+    tracer = both(ball)[1]
+    plain = tracer.closest_hit(origins, directions)
+    tracer._on_gpu = True
+    np.testing.assert_array_equal(tracer.closest_hit(origins, directions).t, plain.t)
+
+
+def test_a_tree_that_goes_round_ends(ball):
+    tracer = both(ball)[1]
+    layout = tracer._layout
+    layout.arrays.nodes[:, 0] &= np.uint32(0xF0000000)
+    tracer._take(layout)
+    with pytest.raises(striptools.errors.StriptoolsError, match="did not end"):
+        tracer.closest_hit(*rays_at(ball, 50, 0))
+
+
+@pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize("remap", [True, False])
+def test_walks_are_hoisted(any_hit, steps, remap):
+    from test_hoisting import loops_outside_hoisted_calls
+
+    tracer = both(scene_of(Mesh(*sphere(3)), remap=remap))[1]
+    options = tracer._options(any_hit=any_hit, steps=steps)
+    lowered = program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
+    text = lowered.compile().as_text()
+    assert 'xla_cpu_small_call="true"' in text
+    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
+    assert loops_outside_hoisted_calls(text) == []
+
+
+def test_the_bottom_of_a_stack_is_done(ball):
+    arrays = lay_out_packed(ball).arrays
+    end = jnp.int32(arrays.node_count - 1)
+    on_device = type(arrays)(*(jnp.asarray(a) for a in arrays[:-1]), arrays.frame)
+    assert int(on_device.child_of(end, jnp.uint32(8))) == DONE
+    assert walk.MARGIN == 2.0**-19
