@@ -118,6 +118,8 @@ def check_instances(
         raise UsageError("a face has a vertex of another geometry", where="geometries")
     if instances.geometry.min() < 0 or instances.geometry.max() >= len(geometries):
         raise UsageError("an instance of a geometry that does not exist", where="instances")
+    if len(np.unique(instances.geometry)) < len(geometries):
+        raise UsageError("a geometry that stands nowhere", where="instances", remedy="leave it out")
 
 
 def determinant_signs(matrix: np.ndarray) -> np.ndarray:
