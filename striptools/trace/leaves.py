@@ -16,6 +16,7 @@ from striptools.partition.object_split import split_objects
 from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
 
 if TYPE_CHECKING:
+    from striptools.reducem.placed import Placed
     from striptools.reducem.scene import Scene
 
 CACHE_LINE = 64
@@ -45,7 +46,7 @@ def lay_out(scene: "Scene") -> Layout:
     return lay_out_wide(scene, wide, np.arange(scene.triangle_count, dtype=np.int32))
 
 
-def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
+def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
     boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
@@ -53,7 +54,9 @@ def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
     return lay_out_tree(scene, tree, split.order)
 
 
-def lay_out_tree(scene: "Scene", tree: BinaryTree, order: Int32[np.ndarray, " n"] | None = None) -> Layout:
+def lay_out_tree(
+    scene: "Scene | Placed", tree: BinaryTree, order: Int32[np.ndarray, " n"] | None = None
+) -> Layout:
     """Lay a scene out for the walk through any binary hierarchy over its triangles.
 
     Args:
@@ -65,7 +68,7 @@ def lay_out_tree(scene: "Scene", tree: BinaryTree, order: Int32[np.ndarray, " n"
     return lay_out_wide(scene, collapse(tree), triangle)
 
 
-def lay_out_wide(scene: "Scene", wide: WideTree, triangle: Int32[np.ndarray, " n"]) -> Layout:
+def lay_out_wide(scene: "Scene | Placed", wide: WideTree, triangle: Int32[np.ndarray, " n"]) -> Layout:
     """Lay a scene out for the walk through an eight-wide hierarchy over its triangles.
 
     Args:
@@ -101,7 +104,7 @@ def lay_out_wide(scene: "Scene", wide: WideTree, triangle: Int32[np.ndarray, " n
     return Layout(WideScene(nodes, blocks, scale, reach), place, triangle_of, wide.depth)
 
 
-def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
+def _names(scene: "Scene | Placed", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
     """The face that a hit on each triangle is reported as, and how its corners are turned."""
     if scene.remap is None:
         return np.arange(count, dtype=np.int32), np.zeros(count, np.uint8)
@@ -120,7 +123,7 @@ def _nodes(wide: WideTree, scale: np.float32) -> np.ndarray:
     return nodes
 
 
-def scale_of(scene: "Scene") -> np.float32:
+def scale_of(scene: "Scene | Placed") -> np.float32:
     """The power of two that brings the largest coordinate to 1 to 2.
 
     Scaling by it is exact, and the model's unit no longer matters.

@@ -36,6 +36,10 @@ class Tracer:
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
 
+    Instances are traced where they stand, every one expanded: a scene with instances takes the memory of its
+    flattened triangles, and `hierarchy` is then always rebuilt. A hit's face is that of the flattened source
+    (`Mesh.flattened` of the mesh that was converted), its triangle one of `scene.placed()`.
+
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
 
@@ -48,6 +52,7 @@ class Tracer:
 
     Raises:
         UsageError: There is no such device or hierarchy.
+        LimitError: All instances have more triangles than a mesh may have.
     """
 
     def __init__(
@@ -64,8 +69,9 @@ class Tracer:
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         self._on_gpu = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
+        stored = hierarchy == "stored" and scene.instances is None
         self._take(
-            lay_out(scene) if hierarchy == "stored" else lay_out_rebuilt(scene, self._builders(threads))
+            lay_out(scene) if stored else lay_out_rebuilt(scene.placed(), self._builders(threads))
         )
 
     def _builders(self, threads: int | None) -> int:
