@@ -98,7 +98,8 @@ def known(codes: list[str], errors: set[str]) -> bool:
 
 def alike(code: str, other: str) -> bool:
     """Whether readers may give these codes to one flaw: of one part, or of a count and what is counted."""
-    return code[:4] == other[:4] or {code, other} in ({"RDM114", "RDM606"}, {"RDM201", "RDM601"})
+    pairs = ({"RDM114", "RDM606"}, {"RDM201", "RDM601"}, {"RDM704", "RDM801"})
+    return code[:4] == other[:4] or {code, other} in pairs
 
 
 def assert_same(scene, decoded) -> None:
@@ -193,9 +194,10 @@ def coordinates(draw, count: int):
 
 @st.composite
 def plans(draw):
-    """A valid file of a few blocks, with or without a remap; boxes are stored where it is one block."""
-    made = draw(st.lists(blocks(), min_size=1, max_size=1))
+    """A valid file of a few blocks, with or without a remap and stored boxes."""
+    made = draw(st.lists(blocks(), min_size=1, max_size=3))
     count = sum(block.count for block in made)
     faces = draw(st.permutations(range(count + 2)))[:count]
     remap = [(face, draw(st.integers(0, 2))) for face in faces] if draw(st.booleans()) else None
-    return make.Plan(made, remap=remap, record={"source_face_count": count + 2})
+    stored, cells = draw(st.booleans()), make.fitting_cells(made)
+    return make.Plan(made, stored, remap=remap, cells=cells, record={"source_face_count": count + 2})

@@ -1,5 +1,7 @@
 """Scenes for the tests, made by the real stages."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 from strategies import clean_meshes
@@ -13,7 +15,7 @@ from striptools.partition.object_split import split_objects
 from striptools.partition.sah import PartitionOptions
 from striptools.reducem.scene import bounds_of, scene_from_strips
 from striptools.strips.grouping import group_sequences, reorder_blocks
-from striptools.strips.ordering import OrderingOptions, order_strips
+from striptools.strips.ordering import OrderingOptions, Sequences, order_strips
 from striptools.strips.stripify import order_cut
 from striptools.strips.topology import encode_strips, split_fans
 
@@ -47,6 +49,29 @@ def scene_of(mesh, *, remap=True, max_length=64, spare_faces=0, flips=False, blo
         source_face_count=mesh.triangle_count + spare_faces,
     )
     return scene.storing_boxes() if boxes == "stored" else scene
+
+
+def with_positions(scene, positions):
+    """The same strips over other positions, (q, 3) float32, one a vertex of a block, under new nodes."""
+    faces, old = scene.faces(), Sequences(np.arange(scene.triangle_count, dtype=np.int32), scene.starts)
+    block_boxes = range_boxes(face_boxes(positions, faces), scene.block_starts)
+    order, top = build_top(block_boxes, np.diff(scene.block_starts), box_grid(*bounds_of(positions)))
+    sequences, starts = reorder_blocks(old, scene.block_starts, order)
+    strips = split_fans(encode_strips(faces, sequences), faces)
+    remap = scene.remap
+    if remap is not None:
+        strips = replace(
+            strips, rotation=(remap.rotation[strips.source_face] + strips.rotation) % np.uint8(3)
+        )
+    return scene_from_strips(
+        positions,
+        strips,
+        starts,
+        top,
+        source_face=None if remap is None else remap.face,
+        source_face_count=scene.source_face_count,
+        error_bound=scene.error_bound,
+    )
 
 
 def small_scene(*, remap=True, flips=False, block=256, boxes="rebuilt"):

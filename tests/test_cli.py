@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import pytest
 import trimesh
 
 import striptools
+from striptools.reducem.reader import read_scene
 from striptools_cli import app, notice
 from striptools_cli.progress import StageProgress
 
@@ -68,6 +70,14 @@ def run_process(
     return subprocess.run(command, input=stdin, capture_output=True, check=False, timeout=120, **options)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
+def without_metadata(file: Path | bytes) -> bytes:
+    """The bytes of a scene file as they would be without metadata, which name the source."""
+    scene = read_scene(file)
+    out = io.BytesIO()
+    replace(scene, metadata={}).save(out)
+    return out.getvalue()
+
+
 def assert_one_error_line(err: str, *parts: str) -> None:
     assert err.startswith("striptools: error: ")
     assert err.count("\n") == 1
@@ -90,7 +100,7 @@ def test_convert_says_one_line(run, folder: Path, tmp_path: Path) -> None:
     assert "-> torus.rdm (" in out
     assert "576 triangles" in out
     assert "vertices per triangle" in out
-    assert (tmp_path / "torus.rdm").read_bytes() == (folder / "torus.rdm").read_bytes()
+    assert without_metadata(tmp_path / "torus.rdm") == without_metadata(folder / "torus.rdm")
 
 
 @pytest.mark.parametrize("form", ["ply", "obj", "stl", "glb"])
@@ -116,7 +126,7 @@ def test_quiet_says_nothing(run, folder: Path, tmp_path: Path) -> None:
 
 def test_verbose_says_stages_and_parts(run, folder: Path, tmp_path: Path) -> None:
     _, out, _ = run("convert", folder / "torus.ply", tmp_path / "a.rdm", "-v")
-    for word in ("load", "clean", "partition", "order", "write", "total", "positions", "remap", "headers"):
+    for word in ("load", "clean", "partition", "order", "write", "total", "positions", "remap", "container"):
         assert f"\n  {word} " in out
 
 
@@ -165,6 +175,59 @@ def test_options_reach_the_stages(run, folder: Path, tmp_path: Path) -> None:
     assert 0.0 < report["weld_error"] <= 0.2
 
 
+def test_a_grid_is_said_and_declared(run, folder: Path, tmp_path: Path) -> None:
+    _, out, _ = run("convert", folder / "torus.ply", tmp_path / "a.rdm", "--bits", 8)
+    assert "\n  quantised: to a grid of " in out
+    scene = striptools.open(tmp_path / "a.rdm")
+    assert scene.grid_exponent is not None
+    facts = json.loads(run("info", tmp_path / "a.rdm", "--format", "json")[1])
+    assert facts["precision"]["kind"] == "grid"
+    assert facts["precision"]["bits"] <= 8
+    assert facts["precision"]["error_bound"] == scene.error_bound > 0
+    assert run("verify", tmp_path / "a.rdm", "--against", folder / "torus.ply", "--rays", 500)[0] == 0
+    for error in (scene.error_bound, f"{scene.error_bound / diagonal(scene) * 1.01}rel"):
+        assert (
+            run("convert", folder / "torus.ply", tmp_path / "b.rdm", "--force", "--max-error", error)[0] == 0
+        )
+        assert striptools.open(tmp_path / "b.rdm").grid_exponent == scene.grid_exponent
+
+
+def diagonal(scene: striptools.Scene) -> float:
+    return float(np.linalg.norm(scene.high.astype(np.float64) - scene.low))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--bits", 8, "--max-error", 1), "leave one out"),
+        (("--max-error", "much"), "1e-4rel"),
+        (("--max-error", -1), "above 0"),
+        (("--max-error", "1e-30"), "more than 24 bits"),
+    ],
+)
+def test_a_precision_that_cannot_be_is_refused(run, folder: Path, tmp_path: Path, options, said) -> None:
+    code, _, err = run("convert", folder / "torus.ply", tmp_path / "a.rdm", *options)
+    assert code == 2
+    assert_one_error_line(err, said)
+    assert not (tmp_path / "a.rdm").exists()
+
+
+def test_stored_boxes_and_archives_hold_the_same_scene(run, folder: Path, tmp_path: Path) -> None:
+    plain = (folder / "torus.ply", tmp_path / "plain.rdm")
+    assert run("convert", *plain, "--boxes", "stored")[0] == 0
+    assert (
+        run("convert", folder / "torus.ply", tmp_path / "packed.rdm", "--boxes", "stored", "--archive")[0]
+        == 0
+    )
+    scene, packed = read_scene(tmp_path / "plain.rdm"), tmp_path / "packed.rdm"
+    assert scene.boxes == "stored"
+    assert packed.stat().st_size < (tmp_path / "plain.rdm").stat().st_size
+    assert without_metadata(packed) == without_metadata(tmp_path / "plain.rdm")
+    code, _, err = run("convert", folder / "torus.rdm", tmp_path / "back.ply", "--archive")
+    assert code == 2
+    assert_one_error_line(err, "--archive")
+
+
 # Refusals
 
 
@@ -176,7 +239,7 @@ def test_an_existing_output_is_refused_without_force(run, folder: Path, tmp_path
     assert_one_error_line(err, "exists already", "--force")
     assert out.read_bytes() == b"mine"
     assert run("convert", folder / "torus.ply", out, "--force")[0] == 0
-    assert out.read_bytes() == (folder / "torus.rdm").read_bytes()
+    assert without_metadata(out) == without_metadata(folder / "torus.rdm")
 
 
 @pytest.mark.parametrize(
@@ -361,7 +424,7 @@ def test_pipes_carry_meshes_and_scenes(folder: Path) -> None:
         "convert", "-", "-", "--from", "ply", "--to", "rdm", stdin=(folder / "torus.ply").read_bytes()
     )
     assert there.returncode == 0
-    assert there.stdout == (folder / "torus.rdm").read_bytes()
+    assert without_metadata(there.stdout) == without_metadata(folder / "torus.rdm")
     assert b"standard input (" in there.stderr
     back = run_process("convert", "-", "-", "--from", "rdm", "--to", "ply", "--quiet", stdin=there.stdout)
     assert (back.returncode, back.stderr) == (0, b"")
@@ -392,10 +455,18 @@ def test_info_has_the_names_that_programs_rely_on(run, folder: Path) -> None:
     scene = striptools.open(folder / "torus.rdm")
     assert code == 0
     assert facts["triangles"] == 576
-    assert facts["vertices"] == 288
+    assert facts["vertices"] == scene.vertex_count
+    assert facts["vertex_duplication"] == pytest.approx(scene.vertex_count / 288)
+    assert facts["blocks"] == scene.block_count
+    assert facts["boxes"] == "rebuilt"
+    assert facts["resident_bytes_per_triangle"] == scene.resident_bytes_per_triangle()
+    assert sum(facts["axes"][name] for name in ("multiples", "multiples_and_minus_zero", "float_bits")) == (
+        3 * scene.block_count
+    )
+    assert facts["metadata"]["generator"] == f"striptools {striptools.__version__}"
     assert facts["strips"] == scene.strip_count
     assert facts["vertices_per_triangle"] == pytest.approx(1 + 2 * scene.strip_count / 576)
-    assert facts["format_version"] == "0.2"
+    assert facts["format_version"] == "0.3"
     assert facts["flips"] == 0
     assert facts["precision"] == {"kind": "lossless", "bits": 32, "error_bound": 0.0}
     parts = facts["bytes"]
@@ -407,7 +478,8 @@ def test_info_has_the_names_that_programs_rely_on(run, folder: Path) -> None:
 def test_info_in_the_other_formats(run, folder: Path) -> None:
     rows = dict(csv.reader(io.StringIO(run("info", folder / "torus.rdm", "--format", "csv")[1])))
     assert rows["triangles"] == "576"
-    assert rows["bytes.positions"] == str(288 * 12)
+    positions = striptools.open(folder / "torus.rdm").part_bytes()["positions"]
+    assert rows["bytes.positions"] == str(positions)
     assert "| triangles | 576 |\n" in run("info", folder / "torus.rdm", "--format", "md")[1]
     assert run("info", folder / "torus.rdm")[1].startswith("torus.rdm\n  triangles ")
 

@@ -10,7 +10,7 @@ from scenes import small_scene
 from striptools.kernels.rays import ROW
 from striptools.trace import Tracer
 from striptools.trace.launch import program
-from striptools.trace.walk_wide import WalkOptions
+from striptools.trace.walk import WalkOptions
 
 
 def loops_outside_hoisted_calls(text):

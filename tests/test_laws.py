@@ -1,13 +1,15 @@
 """Laws of decoders: whatever bytes a file has, it is refused with a code or is a valid scene, soon."""
 
+import io
 import time
 import tracemalloc
 
 import pytest
-from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import scenes
 
+from formats import VECTORS, agree, errors_of, make, mended, plans, reference
 from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene
 from striptools.reducem.validate import validate
@@ -81,6 +83,22 @@ def test_the_plans_decode_to_their_points_and_strips(plan):
     wanted = make.decoding(plan)
     assert ["".join(f"{bits:08x}" for bits in vertex) for vertex in decoded.vertices] == wanted["vertices"]
     assert decoded.faces == wanted["faces"]
+
+
+@given(scenes())
+def test_scenes_of_the_pipeline_are_read_alike(drawn):
+    file = io.BytesIO()
+    drawn[1].save(file)
+    assert agree(file.getvalue()) == set()
+
+
+@given(scenes())
+def test_archives_of_the_pipeline_are_valid(drawn):
+    pytest.importorskip("zstandard")
+    file = io.BytesIO()
+    drawn[1].save(file, archive=True)
+    assert agree(file.getvalue()) == set()
+    assert validate(file.getvalue()) == []
 
 
 @given(st.binary(max_size=400))

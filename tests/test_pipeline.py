@@ -1,5 +1,6 @@
 import io
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,8 @@ from strategies import grid, meshes, sphere, tangle
 
 import striptools
 from striptools.errors import UnreadableMeshError, UsageError
-from striptools.hierarchies.check import check_binary_tree, check_strip_hierarchy
-from striptools.hierarchies.in_strip import expand_hierarchy
 from striptools.mesh.clean import clean
 from striptools.mesh.io import save_mesh
-from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.pipeline import STAGES
 from striptools.reducem.check import check_scene
 from striptools.reducem.validate import validate
@@ -29,8 +27,10 @@ OPTIONS = st.builds(
         max_length=st.sampled_from([1, 2, 7, 64]),
         method=st.sampled_from(METHODS),
         effort=st.sampled_from(EFFORT_NAMES),
-        block=st.sampled_from([None, 16]),
+        block=st.sampled_from([None, 16, 256]),
+        flips=st.booleans(),
     ),
+    boxes=st.sampled_from(["rebuilt", "stored"]),
     remap=st.just(True),
     threads=st.sampled_from([1, 2, 5]),
 )
@@ -75,12 +75,13 @@ def test_a_scene_holds_what_every_stage_promises(mesh, options):
     if clean(mesh, options.clean).mesh.triangle_count == 0:
         return
     scene = striptools.convert(mesh, options)
-    boxes = face_boxes(scene.positions, scene.faces())
     check_scene(scene)
-    check_strip_hierarchy(scene.hierarchy, range_boxes(boxes, scene.starts))
-    check_binary_tree(expand_hierarchy(scene.hierarchy, scene.starts, boxes), boxes)
-    assert not [finding for finding in validate(saved(scene)) if finding.issue.severity == "error"]
+    assert validate(saved(scene)) == []
     assert np.diff(scene.starts).max() <= options.ordering.max_length
+    most = options.ordering.block or 256
+    assert np.diff(scene.block_starts).max() <= most
+    assert np.diff(scene.decoded.vertex_starts).max() <= most
+    assert scene.boxes == options.boxes
 
 
 def test_the_bytes_do_not_depend_on_the_number_of_threads(real_mesh):
@@ -96,8 +97,14 @@ def test_a_path_a_stream_and_a_mesh_give_the_same_scene(tmp_path):
     path = tmp_path / "sphere.ply"
     save_mesh(striptools.Mesh(positions, faces), path)
     from_stream, _ = striptools.convert_with_report(io.BytesIO(path.read_bytes()), file_format="ply")
-    assert saved(striptools.convert(path)) == saved(striptools.convert(str(path))) == saved(from_stream)
+    from_path = striptools.convert(path)
+    assert saved(from_path) == saved(striptools.convert(str(path)))
     assert saved(striptools.convert(striptools.Mesh(positions, faces))) == saved(from_stream)
+    # A path has a name, and that is all.
+    generator = f"striptools {striptools.__version__}"
+    assert from_path.metadata == {"generator": generator, "source": "sphere.ply"}
+    assert from_stream.metadata == {"generator": generator}
+    assert saved(replace(from_path, metadata=from_stream.metadata)) == saved(from_stream)
 
 
 def test_the_report_accounts_for_every_face_and_every_second():
@@ -137,7 +144,7 @@ def test_welding_by_distance_becomes_the_error_bound_of_the_scene():
     mesh = striptools.Mesh(soup, np.arange(len(soup), dtype=np.int32).reshape(-1, 3))
     options = striptools.Options(clean=striptools.CleanOptions(weld=1e-3))
     scene, report = striptools.convert_with_report(mesh, options)
-    assert scene.vertex_count == len(positions)
+    assert scene.to_mesh().vertex_count == len(positions)
     assert 0 < scene.error_bound == report.weld_error <= 1e-3
 
 

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from scenes import scene_of, scenes
 from strategies import grid, sphere
 
-from striptools.hierarchies.in_strip import expand_hierarchy
+from striptools.hierarchies.check import check_binary_tree
 from striptools.measure.quality import (
     count_swaps,
     full_tree_cost,
     length_histogram,
+    quality_tree,
     strip_quality,
     traversal_steps,
 )
@@ -68,7 +69,8 @@ def test_indices_are_those_of_the_common_encoder(pair) -> None:
     _, scene = pair
     quality = strip_quality(scene)
     sequences = Sequences(np.arange(scene.triangle_count, dtype=np.int32), scene.starts)
-    indices = classic_strips(encode_strips(scene.faces(), sequences))
+    welded = scene.leaders[scene.faces()]
+    indices = classic_strips(encode_strips(welded, sequences))
     restarts = (indices == RESTART).sum()
     assert quality.classic_indices == len(indices) / scene.triangle_count
     assert quality.classic_indices_without_restarts == (len(indices) - restarts) / scene.triangle_count
@@ -78,7 +80,10 @@ def test_indices_are_those_of_the_common_encoder(pair) -> None:
 def test_costs_are_sums_over_the_two_trees(pair) -> None:
     _, scene = pair
     boxes = face_boxes(scene.positions, scene.faces())
-    tree = expand_hierarchy(scene.hierarchy, scene.starts, boxes)
+    tree = quality_tree(scene, boxes)
+    leaves = tree.boxes[tree.size == 1]
+    check_binary_tree(tree, leaves)
+    assert sorted(leaves.tolist()) == sorted(boxes.tolist())
     area = half_area(tree.boxes)
     share = area / area[0] if area[0] else np.ones_like(area)
     by_hand = (NODE_COST * share[tree.size > 1]).sum() + (TRIANGLE_COST * share[tree.size == 1]).sum()

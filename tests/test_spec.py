@@ -1,28 +1,31 @@
-"""The specification and the code say the same: tables, sections, issues and the worked bytes."""
+"""The specification and the code say the same: tables, sections, limits, issues and the worked bytes."""
 
-import io
 import re
+import struct
 
 import numpy as np
 import pytest
 from conftest import ROOT
 
+from formats import cases, make, reference
 from striptools.reducem import layout
-from striptools.reducem.issues import ISSUES
+from striptools.reducem.issues import ISSUES, catalogue
 from striptools.reducem.reader import read_scene
 from striptools.reducem.validate import validate
 
 FORMAT = ROOT / "formats" / "reducem"
 SPEC = (FORMAT / "SPEC.md").read_text(encoding="utf-8")
-TYPES = {"8 x char": "S8", "4 x char": "S4", "u16": "<u2", "u32": "<u4", "u64": "<u8", "f64": "<f8"}
+EXAMPLE = SPEC.split("## 9. A worked example", 1)[1]
+TYPES = {
+    **{"8 x char": "S8", "4 x char": "S4", "8 x u8": "8u1", "24 x u8": "24u1", "u8": "u1"},
+    **{f"{kind}{8 * size}": f"<{kind}{size}" for kind in "iuf" for size in (2, 4, 8)},
+}
 LENGTHS = {
-    "24": lambda n, v, s: 24,
-    "12v": lambda n, v, s: 12 * v,
-    "4c": lambda n, v, s: 4 * (n + 2 * s),
-    "ceil(n/8)": lambda n, v, s: -(-n // 8),
-    "4(s+1)": lambda n, v, s: 4 * (s + 1),
-    "28(s-1)": lambda n, v, s: 28 * (s - 1),
-    "4n": lambda n, v, s: 4 * n,
+    "96": lambda n, b, m, r: 96,
+    "32b": lambda n, b, m, r: 32 * b,
+    "64m": lambda n, b, m, r: 64 * m,
+    "4b + 2r": lambda n, b, m, r: 4 * b + 2 * r,
+    "4n + ceil(n/4)": lambda n, b, m, r: 4 * n + -(-n // 4),
 }
 """What the formulas in the specification's table of sections mean."""
 
@@ -37,8 +40,8 @@ def tables(text, header):
 
 
 def example():
-    block = re.search(r"```hex\n(.*?)```", SPEC, re.DOTALL)
-    length = re.search(r"the file has (\d+) bytes", SPEC)
+    block = re.search(r"```hex\n(.*?)```", EXAMPLE, re.DOTALL)
+    length = re.search(r"the file has (\d+) bytes", EXAMPLE)
     assert block
     assert length
     data = bytearray(int(length.group(1)))
@@ -46,6 +49,11 @@ def example():
         at, words = line.split(":")
         data[int(at, 16) : int(at, 16) + 16] = bytes.fromhex(words)
     return bytes(data)
+
+
+def numbers(text):
+    """All rows in brackets as tuples of numbers."""
+    return [tuple(float(x) for x in row.split(",")) for row in re.findall(r"\(([-\d., ]*)\)", text)]
 
 
 def test_the_records_are_the_specifications_tables():
@@ -65,18 +73,54 @@ def test_the_fields_of_a_record_leave_no_byte_out(record):
     assert [record.dtype[field.name].itemsize for field in record.fields] == [f.size for f in record.fields]
 
 
+def test_the_makers_records_are_the_specifications_tables():
+    found = tables(SPEC, "offset | bytes | type | field | rule")
+    assert [row[3] for row in found[0]] == [*make.HEADER, "checksum"]
+    for rows, fields in zip(found[1:4], (make.ENTRY, make.RECORD, make.BLOCK), strict=True):
+        assert [(row[3], int(row[1])) for row in rows] == [
+            (name, struct.calcsize(f"<{kind}")) for name, kind in fields.items()
+        ]
+
+
 def test_the_sections_are_the_specifications_table():
     (rows,) = tables(SPEC, "kind | must be understood | bytes | content")
     assert [(row[0].encode(), row[1] == "yes") for row in rows] == [
         (section.kind, section.must_understand) for section in layout.SECTIONS
     ]
-    for n, v, s in [(1, 3, 1), (13, 15, 4), (1000, 700, 33)]:
-        lengths = layout.section_lengths(n, v, s, flips=True, remap=True)
-        assert [LENGTHS[row[2]](n, v, s) for row in rows] == list(lengths.values())
+    for n, b, m, r in [(1, 1, 0, 1), (13, 2, 4, 9), (1000, 7, 33, 500)]:
+        lengths = layout.section_lengths(n, b, m, r, boxes_stored=True)
+        written = {row[0].encode(): LENGTHS[row[2]](n, b, m, r) for row in rows if row[2] in LENGTHS}
+        assert written == lengths
+        assert layout.section_lengths(n, b, m, r, boxes_stored=False)[b"RUNS"] == 0
+
+
+def test_the_codecs_are_the_specifications_table():
+    (rows,) = tables(SPEC, "codec | name | stored bytes")
+    codecs = [(int(row[0]), row[1]) for row in rows]
+    assert codecs == [(layout.CODEC_RAW, "raw"), (layout.CODEC_ZSTD, "zstd")]
+    assert f"2^{layout.LARGEST_WINDOW} bytes" in rows[1][2]
+
+
+def test_the_limits_are_the_specifications():
+    assert f"1 to {layout.SECTION_LIMIT} |" in SPEC
+    assert f"{layout.GRID_EXPONENTS[0]} to {layout.GRID_EXPONENTS[-1]} where positions lie on a grid" in SPEC
+    assert f"{layout.CELL_EXPONENTS[0]} to {layout.CELL_EXPONENTS[-1]} |" in SPEC
+    assert f"1 to {layout.LONGEST_RUN}; 0 where boxes are not stored" in SPEC
+    assert f"for its k triangles, 1 to {layout.BLOCK_TRIANGLES} |" in SPEC
+    assert f"for its q vertices, 3 to {layout.BLOCK_VERTICES} |" in SPEC
+    assert f"No more than {layout.LONGEST_EQUAL_TURNS} turn bits in a row" in SPEC
+    assert f"there must be {layout.ZERO_WORDS} words of zero" in SPEC
+    assert "at most 2^24; 0 exactly" in SPEC
+    assert (layout.BLOCK_LIMIT, layout.NODE_LIMIT, layout.METADATA_LIMIT) == (2**24, 2**28, 2**20)
+    # A block's stream is longest with all its triangles apart, and 32 bits for each coordinate.
+    words = -(-(3 * 256 + 3 * 256 * 8 + 256 * 96) // 32)
+    assert f"no more than {4 * words}b + 128" in SPEC
+    assert 4 * words == layout.MOST_BLOCK_BYTES
 
 
 def test_the_issues_are_the_catalogue():
     text = (FORMAT / "ISSUES.md").read_text(encoding="utf-8")
+    assert text == catalogue()
     (rows,) = tables(text, "code | severity | clause | message | remedy")
     assert rows == [[i.code, i.severity, i.clause, i.message, i.remedy] for i in ISSUES.values()]
 
@@ -88,41 +132,75 @@ def test_every_clause_is_a_heading():
 
 def test_the_version_and_the_magic_are_the_specifications():
     assert f"**Version** {layout.VERSION[0]}.{layout.VERSION[1]} of the format" in SPEC
+    assert f"major is {layout.VERSION[0]} and minor {layout.VERSION[1]}" in SPEC
     assert layout.MAGIC.hex(" ").upper() in SPEC
 
 
-def test_the_worked_bytes_are_the_scene_that_the_text_says():
+def test_the_worked_bytes_are_the_vector():
+    assert example() == make.encode(cases.worked_example())
+    assert validate(example()) == []
+
+
+def test_the_worked_bytes_are_the_container_that_the_text_says():
     data = example()
-    assert validate(data) == []
-    scene = read_scene(data)
-    counts = (scene.triangle_count, scene.vertex_count, scene.strip_count, scene.source_face_count)
-    assert counts == (4, 8, 2, 5)
-    assert [tuple(face) for face in scene.faces().tolist()] == rows_after("The triangles, in file order:")
-    source = {
-        int(face): row for face, row in zip(scene.remap.face, scene.to_mesh().faces.tolist(), strict=False)
-    }
-    said = re.findall(r"(\d): (\([^)]*\))", SPEC.rsplit("in these positions:", 1)[1])
-    assert source == {int(face): [int(x) for x in row.strip("()").split(",")] for face, row in said}
-    np.testing.assert_array_equal(scene.hierarchy.boxes, [[0, 0, 0, 5, 1, 0]])
-    again = io.BytesIO()
-    scene.save(again)
-    assert again.getvalue() == data
+    told = re.search(r"\*\*Container\.\*\*(.*?)\n\n", EXAMPLE, re.DOTALL)
+    assert told
+    places = [int(at, 16) for at in re.findall(r"\b0[0-9A-F]{2}\b", told[1])][1:]
+    assert places == list(range(32, 32 + 40 * data[12], 40))
+    sections = re.findall(r"([A-Z]{4}) at ([0-9A-F]{3})", told[1].replace("\n", " "))
+    assert len(sections) == data[12]
+    for kind, at in sections:
+        row = data.index(kind.encode())
+        assert struct.unpack_from("<Q", data, row + 8)[0] == int(at, 16)
+        assert data[row + 4] == (kind != "RMAP")
+
+
+def test_the_worked_bits_are_those_of_the_table():
+    data = example()
+    stream = int.from_bytes(data[0x200:0x240], "little")
+    (rows,) = tables(EXAMPLE, "part | first bit | bits, in numbers of |")
+    for _, first, widths, written in rows:
+        at = int(first)
+        row = [int(width) for width in widths.split(" and ")]
+        values = [int(x) for x in re.findall(r"\d+", written)]
+        for i, value in enumerate(values):
+            width = row[i % len(row)]
+            assert stream >> at & (1 << width) - 1 == value
+            at += width
+    assert at == 41
+    assert f"the words {data[0x203:0x1FF:-1].hex().upper()} and {data[0x207:0x203:-1].hex().upper()}" in SPEC
+
+
+def test_the_worked_bytes_are_the_scene_that_the_text_says():
+    scene = read_scene(example())
+    counts = (scene.triangle_count, scene.block_count, scene.source_face_count)
+    assert f"n = {counts[0]}, b = {counts[1]}, m = {len(scene.packed.nodes)}, top_count = " in EXAMPLE
+    assert f"source_face_count = {counts[2]}" in EXAMPLE
+    faces = numbers(EXAMPLE.split("The triangles, in file order:", 1)[1].split("\n\n")[0])
+    np.testing.assert_array_equal(scene.faces(), faces)
+    told = [
+        numbers(EXAMPLE.split(word, 1)[1].split("Triangle 1")[0]) for word in ("vertices are", "block 0, are")
+    ]
+    positions = np.array([*told[0], *told[1][:4]], np.float32)
+    np.testing.assert_array_equal(scene.positions.view(np.uint32), positions.view(np.uint32))
+    source = dict(
+        zip(scene.remap.face.tolist(), scene.to_mesh().positions[scene.to_mesh().faces], strict=False)
+    )
+    rows = re.findall(r"(\d): (\([^)]*\))", EXAMPLE.split("in these\npositions:", 1)[1])
+    order = np.argsort(scene.remap.face)
+    assert [int(face) for face, _ in rows] == scene.remap.face[order].tolist()
+    assert len(source) == len(rows)
+    for (face, row), t in zip(rows, order, strict=True):
+        turned = np.roll(scene.faces()[t], scene.remap.rotation[t])
+        assert numbers(row) == [tuple(turned.astype(float))], face
+
+
+def test_the_worked_bytes_are_written_again_by_the_writer(tmp_path):
+    path = tmp_path / "again.rdm"
+    read_scene(example()).save(path)
+    assert path.read_bytes() == example()
 
 
 def test_the_decoding_of_the_specification_gives_the_same_triangles():
     scene = read_scene(example())
-    emitted = []
-    for i in range(scene.strip_count):
-        at = scene.starts[i] + 2 * i
-        a, b, c = scene.vertices[at : at + 3]
-        emitted.append((a, b, c))
-        for t in range(scene.starts[i] + 1, scene.starts[i + 1]):
-            w = scene.vertices[at + 2 + t - scene.starts[i]]
-            a, b, c = (a, c, w) if scene.turns[t] else (c, b, w)
-            emitted.append((b, a, c) if scene.flips[t] else (a, b, c))
-    np.testing.assert_array_equal(emitted, scene.faces())
-
-
-def rows_after(sentence):
-    line = SPEC.split(sentence, 1)[1].strip().splitlines()[0]
-    return [tuple(int(x) for x in row.split(",")) for row in re.findall(r"\(([^)]*)\)", line)]
+    assert reference.read(example()).faces == scene.faces().tolist()

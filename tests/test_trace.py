@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import scene_of, scenes, small_scene
+from scenes import scene_of, scenes, small_scene, with_positions
 from strategies import book, cube, fan, grid, soup, sphere, stack
 
 from striptools.errors import StriptoolsError, UsageError
@@ -16,7 +16,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 from striptools.trace.launch import _collect, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
-from striptools.trace.walk_wide import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
+from striptools.trace.walk import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
 
 LOWEST = np.finfo(np.float32).min
 
@@ -358,7 +358,7 @@ def test_there_is_no_third_hierarchy(ball):
 
 @pytest.mark.parametrize("unit", [2.0**-100, 1e-3, 1.0, 2.0**100])
 def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit):
-    scene = replace(ball, positions=(ball.positions * np.float32(unit)).astype(np.float32))
+    scene = with_positions(ball, (ball.positions * np.float32(unit)).astype(np.float32))
     arrays = lay_out(scene).arrays
     origins, directions = aimed_rays(scene.positions, scene.faces(), 2000, 12)
     random = np.random.default_rng(13)
@@ -387,11 +387,7 @@ def test_power_of_two_units_change_nothing(ball):
     origins, directions = aimed_rays(ball.positions, ball.faces(), 500, 8)
     expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
     for unit in (np.float32(2.0**-40), np.float32(2.0**40)):
-        scene = replace(
-            ball,
-            positions=ball.positions * unit,
-            hierarchy=replace(ball.hierarchy, boxes=ball.hierarchy.boxes * unit),
-        )
+        scene = with_positions(ball, ball.positions * unit)
         tracer = Tracer(scene, device="cpu", threads=1)
         hits = tracer.closest_hit(origins * unit, directions * unit * np.float32(2.0**20))
         np.testing.assert_array_equal(hits.t * np.float32(2.0**20), expected.t)

@@ -1,11 +1,14 @@
 """The conformance vectors are what their maker makes, and every reader makes of them what they say."""
 
+import contextlib
 import hashlib
 import json
 
 import pytest
-from formats import VECTORS, agree, cases, errors_of, make, reference
 
+import striptools
+from formats import VECTORS, agree, cases, errors_of, make, reference
+from striptools.errors import StriptoolsError
 from striptools.reducem.validate import validate
 
 FILES = cases.all_files()
@@ -69,6 +72,22 @@ def test_an_invalid_file_has_the_issues_it_says(path):
         pytest.importorskip("zstandard")
     assert sorted(errors_of(path.read_bytes())) == codes
     assert agree(path.read_bytes()) == set(codes)
+
+
+@pytest.mark.parametrize("path", INVALID, ids=lambda path: path.stem)
+def test_an_invalid_file_ends_in_an_error_line_whatever_is_asked_first(path):
+    asked = [
+        lambda s: s.remap,
+        lambda s: s.metadata,
+        lambda s: s.packed,
+        lambda s: s.faces(),
+        lambda s: s.low,
+    ]
+    for ask in (*asked, lambda scene: scene.check()):
+        with contextlib.suppress(StriptoolsError):
+            ask(striptools.open(path))
+    with pytest.raises(StriptoolsError):
+        striptools.open(path).check()
 
 
 def test_unknown_sections_are_said_and_no_error():

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis.strategies import booleans
 from oracles import OracleTracer
+from scenes import with_positions
 from strategies import cube, grid, meshes, sphere, stack
 
 from striptools.errors import UsageError
@@ -213,7 +214,7 @@ class TestFaultsAreCaught:
         mesh = Mesh(*cube())
         scene = scene_of(mesh, remap=False)
         mirrored = scene.positions * np.array([1, 1, -1], np.float32) + np.array([0, 0, 1], np.float32)
-        assert verify(replace(scene, positions=mirrored), mesh, FEW).disagreements > 0
+        assert verify(with_positions(scene, mirrored), mesh, FEW).disagreements > 0
 
 
 class TestStructure:
@@ -258,7 +259,7 @@ class TestStructure:
         scene = scene_of(mesh, remap=remap)
         moved = scene.positions.copy()
         moved[7, 1] = np.nextafter(moved[7, 1], np.float32(9))
-        assert compare_structure(replace(scene, positions=moved), mesh).errors > 0
+        assert compare_structure(with_positions(scene, moved), mesh).errors > 0
 
     def test_a_face_that_is_there_twice(self, ball: tuple[Scene, Mesh]) -> None:
         scene, mesh = ball
@@ -280,10 +281,8 @@ class TestStructure:
         for remap in (True, False):
             scene = replace(scene_of(mesh, remap=remap), error_bound=1e-3)
             assert compare_structure(scene, mesh).errors == 0
-            assert (
-                compare_structure(replace(scene, positions=scene.positions * np.float32(1.01)), mesh).wrong
-                > 0
-            )
+            larger = with_positions(scene, scene.positions * np.float32(1.01))
+            assert compare_structure(larger, mesh).wrong > 0
 
     def test_another_source_is_refused(self, ball: tuple[Scene, Mesh]) -> None:
         with pytest.raises(UsageError, match="12 faces"):

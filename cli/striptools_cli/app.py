@@ -21,6 +21,7 @@ from striptools_cli.streams import say
 VERBS = {
     "convert": "Turn a mesh into a scene file, or a scene file back into a mesh.",
     "info": "Say what is in a scene file, and how many bytes each part takes.",
+    "validate": "Name every rule of the format that a scene file breaks.",
     "verify": "Trace a scene file with JAX and prove it against its source mesh.",
     "render": "Draw a picture of a scene file with the same tracer.",
     "study": "Compare what stripifiers make of a mesh: memory, rays a second, quality.",

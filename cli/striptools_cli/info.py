@@ -22,8 +22,10 @@ def run(
     `vertices` counts those of all blocks, so that one that several blocks share counts for each of them
     (`vertex_duplication`: how often on the average), `vertices_per_triangle` the entries of the strips: n + 2
     for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
-    what tracing needs, so every part but the remap and attributes, before compression; `resident_bytes_per_triangle` what a
-    tracer holds that traces the blocks as they are, boxes and all.
+    what tracing needs, so every part but the remap and attributes, before compression;
+    `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all. Where a
+    scene has instances all of that is of the geometries, stored once; `placed_triangles` are those of all
+    instances.
     """
     log.set_up()
     file = Source.open(source)
@@ -58,9 +60,7 @@ def describe(scene: Scene) -> dict[str, object]:
         "remap": scene.remap is not None,
         "source_faces": scene.source_face_count,
         "bounds": {"lowest": scene.low.tolist(), "highest": scene.high.tolist()},
-        "metadata": {
-            _printable(name): _printable(str(value)) for name, value in scene.metadata.items()
-        },
+        "metadata": {_printable(name): _printable(str(value)) for name, value in scene.metadata.items()},
     }
 
 
@@ -75,6 +75,14 @@ def _carried(scene: Scene) -> dict[str, object]:
         }
     if scene.materials:
         found["materials"] = len(scene.materials)
+    if scene.instances is not None and scene.geometries is not None:
+        found["instances"] = {
+            "geometries": len(scene.geometries),
+            "instances": len(scene.instances),
+            "placed_triangles": scene.placed_count,
+            "bytes": scene.part_bytes()["instances"],
+            "bytes_per_placed_triangle": _share(sum(scene.part_bytes().values()), scene.placed_count),
+        }
     if scene.origin is not None:
         found["origin"] = scene.origin.tolist()
     return found

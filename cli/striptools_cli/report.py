@@ -38,20 +38,23 @@ def render(record: Record, form: Format, title: str = "") -> str:
     return writers[form](record, title)
 
 
-def render_table(rows: Sequence[Record], form: Format, title: str = "") -> str:
+def render_table(
+    rows: Sequence[Record], form: Format, title: str = "", *, names: Sequence[str] | None = None
+) -> str:
     """Write records with the same names down as a table, a row each.
 
     Args:
-        rows: At least one; names and rows keep their order.
+        rows: The records; names and rows keep their order.
         form: `text`, `json`, `csv` or `md`.
         title: A heading for text and md; json and csv leave it out.
+        names: Their names; needed only where there may be no row.
 
     Returns:
         Lines, each ended by a newline.
     """
     if form == "json":
         return json.dumps(_jsonable(list(rows)), indent=2, allow_nan=False) + "\n"
-    names = list(rows[0])
+    names = list(rows[0] if names is None else names)
     cells = [[_plain(row[name]) for name in names] for row in rows]
     if form == "csv":
         lines = io.StringIO()

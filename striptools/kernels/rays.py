@@ -1,7 +1,7 @@
-"""Kernel that readies rays for the walk on a CPU: what `trace.walk_wide` prepares, and the visit to the root.
+"""Kernel that readies rays for the walk on a CPU: what `trace.walk` prepares, and the visit to the root.
 
 Rays that miss every child of the root end here, and never reach the device. The arithmetic is that of
-`trace.walk_wide.prepared_rays`, bit for bit, denormals read and written as zeros.
+`trace.walk.prepared_rays`, bit for bit, denormals read and written as zeros.
 """
 
 import numpy as np
@@ -10,14 +10,13 @@ from numba import njit
 from striptools.kernels.wide import EMPTY, WIDTH
 
 ROW = 24
-"""Words of a ready ray: 17 float32, then 7 int32; see `trace.walk_wide.Ready`."""
+"""Words of a ready ray: 17 float32, then 7 int32; see `trace.walk`."""
 
 ONE = np.float32(1)
 ZERO = np.float32(0)
 LARGEST = np.float32(np.finfo(np.float32).max)
 LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 FAR_FACTOR = np.float32(1 + 2**-21)
-MARGIN = np.float32(2**-21)
 TINY = np.float32(2**-60)
 SLACK = np.float32(1 + 2**-20)
 HIGHEST_BIT = np.array([max(k.bit_length() - 1, 0) for k in range(2**WIDTH)], np.uint8)
@@ -73,9 +72,7 @@ def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def ready_rays(
-    origins, directions, t_max, begin, scale, reach, root, children, visit, rays, words, at, dropped
-):
+def ready_rays(origins, directions, t_max, begin, frame, root, children, visit, rays, words, at, dropped):
     """Ready rays from `begin` on until the places are full or there are none left.
 
     Args:
@@ -83,9 +80,9 @@ def ready_rays(
         directions: (r, 3) float32.
         t_max: (r,) float32.
         begin: The first ray to take.
-        scale: float32 power of two that origins are multiplied by.
-        reach: float32, the largest scaled coordinate of the scene.
-        root: (7, 8) float32, the boxes of the root's children, NaN in empty lanes; row 6 is not read.
+        frame: `trace.walk.Frame` as float32 and arrays of three: scale, reach, low, unit, margin.
+        root: (>= 6, 8) float32, the boxes of the root's children, counted from low and in units; NaN in empty
+            lanes; other rows are not read.
         children: (8,) int32, the root's children.
         visit: Whether to visit the root here; else every valid ray starts at it.
         rays: (k, 24) float32, written, a row for each ray that has something to visit.
@@ -96,6 +93,7 @@ def ready_rays(
     Returns:
         The number of rows written, and the first ray not taken.
     """
+    scale, reach, low, unit, margin_unit = frame
     room = len(rays)
     count = 0
     for r in range(begin, len(origins)):
@@ -126,16 +124,17 @@ def ready_rays(
         far = flushed(flushed(far * length) * scale)
 
         # Make the constants of the slab test.
-        margin = MARGIN * larger(largest, reach)
+        margin = margin_unit * larger(largest, reach)
         mirror = np.int32(7)
         mirror ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
         ix, iy, iz = ONE / steep(dx), ONE / steep(dy), ONE / steep(dz)
-        lx = flushed(flushed(ox + margin) * ix)
-        ly = flushed(flushed(oy + margin) * iy)
-        lz = flushed(flushed(oz + margin) * iz)
-        hx = flushed(flushed(ox - margin) * ix)
-        hy = flushed(flushed(oy - margin) * iy)
-        hz = flushed(flushed(oz - margin) * iz)
+        lx = flushed(flushed(flushed(ox + margin) - low[0]) * ix)
+        ly = flushed(flushed(flushed(oy + margin) - low[1]) * iy)
+        lz = flushed(flushed(flushed(oz + margin) - low[2]) * iz)
+        hx = flushed(flushed(flushed(ox - margin) - low[0]) * ix)
+        hy = flushed(flushed(flushed(oy - margin) - low[1]) * iy)
+        hz = flushed(flushed(flushed(oz - margin) - low[2]) * iz)
+        ix, iy, iz = flushed(ix * unit[0]), flushed(iy * unit[1]), flushed(iz * unit[2])
 
         # Visit the root: a ray that meets none of its children is done.
         child = np.int32(0)

@@ -229,18 +229,35 @@ def emit_wide(boxes, size, split, as_leaf):
 
 
 @njit(cache=True, nogil=True)
-def comes_before(positions, a, b):
-    """Whether position a is smaller than position b by x, then y, then z."""
-    for axis in range(3):
-        if positions[a, axis] != positions[b, axis]:
-            return positions[a, axis] < positions[b, axis]
-    return False
-
-
-@njit(cache=True, nogil=True)
 def flushed(value):
     """Zero for a denormal float32, as XLA has it."""
     return value if abs(value) >= LEAST_NORMAL else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def scaled(value, scale):
+    """A float32 times a power of two as the walks have it: zero where that is no normal number."""
+    exact = np.float64(value) * np.float64(scale)
+    return np.float32(exact) if abs(exact) >= np.float64(LEAST_NORMAL) else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def comes_before(corners, a, b):
+    """Whether corner a of a triangle is smaller than corner b by x, then y, then z."""
+    for axis in range(3):
+        if corners[a, axis] != corners[b, axis]:
+            return corners[a, axis] < corners[b, axis]
+    return False
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def first_corner(corners):
+    """The corner that comes first in the one order that all tests use: the smallest, the first of equals."""
+    turn = 0
+    for j in range(1, 3):
+        if comes_before(corners, j, turn):
+            turn = j
+    return turn
 
 
 @njit(cache=True, nogil=True)
@@ -249,8 +266,8 @@ def fill_leaf_blocks(
 ):
     """Write the triangles of each leaf, lane by lane, in the one corner order that all tests use.
 
-    A triangle is turned, its winding kept, until its smallest corner by (x, y, z) comes first: whatever
-    strip, file order or remap it came by, its arithmetic is the same.
+    A triangle is turned, its winding kept, until its smallest scaled corner by (x, y, z) comes first:
+    whatever strip, file order or remap it came by, its arithmetic is the same.
 
     Args:
         positions: (v, 3) float32.
@@ -265,26 +282,74 @@ def fill_leaf_blocks(
         place: (>= max(ids) + 1,) int32, written: `(leaf * 8 + lane) * 4 + turn` of each face, where
             canonical corner j is the reported face's corner (j + turn) % 3.
     """
+    corners = np.empty((3, 3), np.float32)
     for q in range(len(leaf_first)):
         for lane in range(leaf_count[q]):
             t = leaf_first[q] + lane
-            turn = 0
-            for j in range(1, 3):
-                if comes_before(positions, faces[t, j], faces[t, turn]):
-                    turn = j
             for j in range(3):
-                corner = faces[t, (j + turn) % 3]
                 for axis in range(3):
-                    blocks[q, 3 * axis + j, lane] = flushed(positions[corner, axis] * scale)
+                    corners[j, axis] = scaled(positions[faces[t, j], axis], scale)
+            turn = first_corner(corners)
+            for j in range(3):
+                for axis in range(3):
+                    blocks[q, 3 * axis + j, lane] = corners[(j + turn) % 3, axis]
             block_bits[q, 9, lane] = ids[t]
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3
+
+
+@njit(cache=True, nogil=True)
+def weigh_corners(origins, directions, r, scale, corners, turn, weights):
+    """Where on its face a hit lies: the watertight test's own edge functions, once, for the face hit.
+
+    Args:
+        origins: (r, 3) float32.
+        directions: (r, 3) float32, not zero.
+        r: The ray.
+        scale: float32, what corners were multiplied by.
+        corners: (3, 3) float32, scaled, a row a corner, in the order of the tests.
+        turn: Corner j is the face's corner (j + turn) % 3.
+        weights: (3,) float32, written: of the face's corners.
+    """
+    way = np.zeros(3, np.float32)
+    start = np.zeros(3, np.float32)
+    x = np.zeros(3, np.float32)
+    y = np.zeros(3, np.float32)
+
+    # Take the ray as the walk does, which reads denormals as zero.
+    for axis in range(3):
+        way[axis] = flushed(directions[r, axis])
+        start[axis] = flushed(flushed(origins[r, axis]) * scale)
+
+    # Shear the corners, which hold no denormals, so that the ray runs along its dominant axis.
+    size_x = abs(way[0])
+    size_y = abs(way[1])
+    size_z = abs(way[2])
+    kz = 0 if size_x >= size_y and size_x >= size_z else (1 if size_y >= size_z else 2)
+    kx = 0 if kz == 2 else kz + 1
+    ky = 0 if kx == 2 else kx + 1
+    slope_x = flushed(way[kx] / way[kz])
+    slope_y = flushed(way[ky] / way[kz])
+    for j in range(3):
+        z = flushed(corners[j, kz] - start[kz])
+        x[j] = flushed(flushed(corners[j, kx] - start[kx]) - flushed(slope_x * z))
+        y[j] = flushed(flushed(corners[j, ky] - start[ky]) - flushed(slope_y * z))
+
+    # Weigh the corners, and name them as the reported face does.
+    a = flushed(flushed(x[2] * y[1]) - flushed(y[2] * x[1]))
+    b = flushed(flushed(x[0] * y[2]) - flushed(y[0] * x[2]))
+    c = flushed(flushed(x[1] * y[0]) - flushed(y[1] * x[0]))
+    whole = a + b + c
+    inverse = np.float32(1.0) / whole if whole != 0.0 else np.float32(0.0)
+    weights[turn] = a * inverse
+    weights[(turn + 1) % 3] = b * inverse
+    weights[(turn + 2) % 3] = c * inverse
 
 
 @njit(cache=True, nogil=True)
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
 ):
-    """Where on its face each hit lies: the watertight test's own edge functions, once, for the face hit.
+    """Where on its face each hit lies, from the leaf blocks.
 
     Args:
         origins: (r, 3) float32.
@@ -303,10 +368,7 @@ def weigh_hits(
         triangle: (r,) int32, written; -1 on a miss.
     """
     weights = np.zeros(3, np.float32)
-    way = np.zeros(3, np.float32)
-    start = np.zeros(3, np.float32)
-    x = np.zeros(3, np.float32)
-    y = np.zeros(3, np.float32)
+    corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
         r = at[k]
         t[r] = found_t[k]
@@ -318,40 +380,9 @@ def weigh_hits(
             continue
         triangle[r] = triangle_of[face[r]]
         slot = place[face[r]]
-        leaf = slot >> 5
-        lane = (slot >> 2) & 7
-        turn = slot & 3
-
-        # Take the ray as the walk does, which reads denormals as zero.
-        for axis in range(3):
-            way[axis] = flushed(directions[r, axis])
-            start[axis] = flushed(flushed(origins[r, axis]) * scale)
-
-        # Shear the corners, which hold no denormals, so that the ray runs along its dominant axis.
-        size_x = abs(way[0])
-        size_y = abs(way[1])
-        size_z = abs(way[2])
-        kz = 0 if size_x >= size_y and size_x >= size_z else (1 if size_y >= size_z else 2)
-        kx = 0 if kz == 2 else kz + 1
-        ky = 0 if kx == 2 else kx + 1
-        slope_x = flushed(way[kx] / way[kz])
-        slope_y = flushed(way[ky] / way[kz])
         for j in range(3):
-            z = flushed(blocks[leaf, 3 * kz + j, lane] - start[kz])
-            near_x = flushed(blocks[leaf, 3 * kx + j, lane] - start[kx])
-            near_y = flushed(blocks[leaf, 3 * ky + j, lane] - start[ky])
-            x[j] = flushed(near_x - flushed(slope_x * z))
-            y[j] = flushed(near_y - flushed(slope_y * z))
-
-        # Weigh the corners, and name them as the reported face does.
-        a = flushed(flushed(x[2] * y[1]) - flushed(y[2] * x[1]))
-        b = flushed(flushed(x[0] * y[2]) - flushed(y[0] * x[2]))
-        c = flushed(flushed(x[1] * y[0]) - flushed(y[1] * x[0]))
-        whole = a + b + c
-        inverse = np.float32(1.0) / whole if whole != 0.0 else np.float32(0.0)
-
-        weights[turn] = a * inverse
-        weights[(turn + 1) % 3] = b * inverse
-        weights[(turn + 2) % 3] = c * inverse
+            for axis in range(3):
+                corners[j, axis] = blocks[slot >> 5, 3 * axis + j, (slot >> 2) & 7]
+        weigh_corners(origins, directions, r, scale, corners, slot & 3, weights)
         u[r] = weights[1]
         v[r] = weights[2]

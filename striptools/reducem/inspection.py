@@ -45,7 +45,8 @@ class Inspection:
     def found(self, code: str, place: str = "", offset: int | None = None) -> None:
         """Note an issue at a byte of the file."""
         where = f"{self.where}: {place}" if place else self.where
-        self.findings.append(Finding(ISSUES[code], where, None if offset is None else int(offset)))
+        byte = None if offset is None else int(offset)
+        self.findings.append(Finding(ISSUES[code], where, byte, place))
 
     def found_where(
         self, code: str, wrong: np.ndarray, place: Callable[[int], str], offset: Callable[[int], int]

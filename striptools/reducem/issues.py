@@ -30,11 +30,19 @@ class Issue:
 
 @dataclass(frozen=True)
 class Finding:
-    """An issue found in a file, and where; `offset` is the byte of the file, None where none is to blame."""
+    """An issue found in a file, and where.
+
+    Attributes:
+        issue: What is wrong.
+        where: The file, and the place in it in words.
+        offset: The byte of the file; None where none is to blame.
+        place: The place in words alone.
+    """
 
     issue: Issue
     where: str
     offset: int | None = None
+    place: str = ""
 
     def __str__(self) -> str:
         """Give one line for the user."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from striptools.mesh.instances import Instances, placed_faces, placed_positions
 from striptools.mesh.mesh import MOST_FACES
 from striptools.mesh.recentre import Origin
 from striptools.partition.boxes import face_boxes
-from striptools.reducem.scene import Remap, Scene
+from striptools.reducem.scene import Remap, Scene, bounds_of
 from striptools.threads import every_core
 from striptools.types import Boxes, Counts, Faces, Positions
 
@@ -55,6 +56,16 @@ class Placed:
     def triangle_count(self) -> int:
         """Triangles of all instances."""
         return len(self.triangles)
+
+    @cached_property
+    def low(self) -> np.ndarray:
+        """(3,) float32, the least coordinates, -0.0 as 0.0."""
+        return bounds_of(self.positions)[0]
+
+    @cached_property
+    def high(self) -> np.ndarray:
+        """(3,) float32, the largest."""
+        return bounds_of(self.positions)[1]
 
     def faces(self) -> Faces:
         """(n, 3) int32 triangles, instances in their order, those of each in file order."""

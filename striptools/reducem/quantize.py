@@ -95,6 +95,11 @@ def grid_bound(exponent: int) -> float:
     return math.sqrt(0.75) * math.ldexp(1.0, exponent) * SLACK
 
 
+def declared_bound(exponent: int, already: float = 0.0) -> float:
+    """The bound of a grid, and of what moved positions before."""
+    return (grid_bound(exponent) + already) * SLACK if already else grid_bound(exponent)
+
+
 def grid_exponent_for(bounds: np.ndarray, bits: int) -> int:
     """The finest grid on which the longest side of a box has fewer than 2**bits steps.
 
@@ -107,9 +112,9 @@ def grid_exponent_for(bounds: np.ndarray, bits: int) -> int:
     """
     low, high = np.asarray(bounds, np.float64)
     longest = float((high - low).max())
-    least = GRID_EXPONENTS.start
-    exponent = max(math.frexp(longest)[1] - bits - 1, least) if longest else least
-    while exponent < GRID_EXPONENTS.stop - 1:
+    least, most = GRID_EXPONENTS.start, GRID_EXPONENTS.stop - 1
+    exponent = min(max(math.frexp(longest)[1] - bits - 1, least), most) if longest else least
+    while exponent < most:
         steps = np.rint(np.ldexp(high, -exponent)) - np.rint(np.ldexp(low, -exponent))
         if steps.max() < 2**bits:
             break
@@ -130,7 +135,7 @@ def exponent_for_error(bounds: np.ndarray, largest: float, already: float = 0.0)
     """
     for bits in range(LEAST_BITS, MOST_BITS + 1):
         exponent = grid_exponent_for(bounds, bits)
-        if (grid_bound(exponent) + already) * SLACK <= largest:
+        if declared_bound(exponent, already) <= largest:
             return exponent
     raise UsageError(
         f"an error of at most {largest:.3g} takes more than {MOST_BITS} bits",
@@ -181,8 +186,7 @@ def quantise(
     }
     source_face = cleaned.source_face[again.source_face]
     result = replace(cleaned, mesh=again.mesh, source_face=source_face, counts=counts)
-    bound = grid_bound(exponent)
-    return Quantised(result, exponent, (bound + already) * SLACK if already else bound)
+    return Quantised(result, exponent, declared_bound(exponent, already))
 
 
 def check_bound(

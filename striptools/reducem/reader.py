@@ -232,7 +232,7 @@ class _File:
         if entry.codec == layout.CODEC_RAW:
             return np.frombuffer(payload, np.uint8)
         raw = expanded(payload, entry.raw_length, place)
-        if zlib.crc32(raw) != entry.raw_checksum:
+        if zlib.crc32(raw.data) != entry.raw_checksum:
             raise unreadable("RDM122", place)
         return raw
 

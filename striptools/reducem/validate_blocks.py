@@ -197,7 +197,7 @@ def _decode(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> tuple
         "RDM614",
         (a == b) | (b == c) | (c == a),
         lambda i: f"BLKD: block {chunk[row[i]]}, triangle {t[i]}",
-        lambda i: blocks.data.at(4 * blocks.word[chunk[row[i]]]),
+        lambda i: blocks.data.at(4 * int(blocks.word[chunk[row[i]]])),
     )
     offsets = (np.cumsum(blocks.q[chunk]) - blocks.q[chunk])[row]
     positions = [vertices[corner + offsets] for corner in corners]
@@ -268,7 +268,7 @@ def _indices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.n
         "RDM613",
         used < q,
         lambda i: f"BLKD: block {chunk[i]}",
-        lambda i: blocks.bit_at(blocks.base[chunk[i]] + (2 + blocks.f[chunk[i]]) * blocks.k[chunk[i]]),
+        lambda i: blocks.bit_at(int((blocks.base + (2 + blocks.f) * blocks.k)[chunk[i]])),
     )
     return None if broken else index
 

@@ -25,12 +25,16 @@ _NODE = np.dtype(
 
 @dataclass(frozen=True)
 class _Runs:
-    """The runs: the number of each block's first, and for each its block, first triangle and length."""
+    """The runs: the number of each block's first, and for each its block, first triangle and length.
+
+    `whole` says whether they have each triangle once.
+    """
 
     starts: np.ndarray
     block: np.ndarray
     first: np.ndarray
     count: np.ndarray
+    whole: bool
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class _Nodes:
 
 
 def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
-    """Look at the runs, where boxes are stored, and at the nodes; without sound blocks, at what nodes name."""
+    """Look at runs, where boxes are stored, and at nodes; without sound blocks, at what nodes name."""
     record = inspection.sections["SCEN"].data
     blocks, count, top, run_count = (int(x) for x in np.frombuffer(record, "<u4", 4, 4))
     stored = record[24] & 1
@@ -68,13 +72,14 @@ def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
     sound = _blocks(inspection, nodes)
     if runs is not None and parents is not None:
         sound = _leaves(inspection, nodes, parents, runs) and sound
-    sound = sound and (runs is not None or not stored) and parents is not None
+    whole = not stored or (runs is not None and runs.whole)
+    sound = sound and whole and parents is not None
     if geometry is not None and sound and (nodes.is_inner | nodes.is_leaf).any(axis=1).all():
         _boxes(inspection, nodes, geometry, runs)
 
 
 def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) -> _Runs | None:
-    """Look at the runs; gives them where each is inside its block."""
+    """Look at the runs; gives them where those of each block follow those of the one before."""
     section = inspection.sections["RUNS"]
     b = len(geometry.starts) - 1
     starts = np.append(np.frombuffer(section.data, "<u4", b).astype(np.int64), count)
@@ -103,13 +108,13 @@ def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) 
     over = begun[last] != begun[np.minimum(first, len(begun) - 1)]
     check("RDM802", outside | over | (length > longest))
     if outside.any():
-        return None
+        return _Runs(starts, block, first, length, whole=False)
     triangles = np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
     times = np.bincount(triangles, minlength=len(begun))
     wrong = inspection.found_where(
         "RDM803", times != 1, lambda t: f"RUNS: triangle {t}", lambda t: section.at(4 * b)
     )
-    return None if wrong else _Runs(starts, block, first, length)
+    return _Runs(starts, block, first, length, whole=not wrong)
 
 
 def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
@@ -144,7 +149,7 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
     outside = nodes.is_inner & ((nodes.child < least) | (nodes.child >= most))
     at = nodes.section.at
     wrong = inspection.found_where(
-        "RDM701", outside.any(axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
+        "RDM701", np.any(outside, axis=1), lambda i: f"NODE: node {i}", lambda i: at(64 * i)
     )
     parent, slot = np.nonzero(nodes.is_inner & ~outside)
     child = nodes.child[parent, slot]

@@ -70,7 +70,7 @@ def part_sizes(scene: Scene) -> dict[str, int]:
     """Count the bytes of a scene's file by part, uncompressed, without writing it."""
     totals, packed = scene.blocks.totals(), scene.packed
     lengths = _lengths(scene)
-    parts = dict.fromkeys(layout.PARTS, 0)
+    parts: dict[str, int] = dict.fromkeys(layout.PARTS, 0)
     parts["positions"] = -(-totals["position_bits"] // 8)
     parts["connectivity"] = totals["connectivity_bits"] // 8
     parts["block_headers"] = lengths[layout.BLOCK_HEADERS.kind]

@@ -17,7 +17,7 @@ Differences:
 3. minimum and maximum are comparisons and selects. Empty lanes hold NaN and are never met.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,26 +36,30 @@ TINY = np.float32(2**-60)
 
 
 class Slab(NamedTuple):
-    """Origin times inverse direction, for low and for high sides, and the inverse direction."""
+    """Origin times inverse direction, for low and for high sides, and the inverse direction.
+
+    (3,) each; counted from the frame's `low` and in its `unit`.
+    """
 
     low: Array
     high: Array
     inverse: Array
 
 
-def slab_of(origin: Array, direction: Array, reach: Array) -> Slab:
+def slab_of(origin: Array, direction: Array, frame: Any) -> Slab:
     """Slab constants of a ray.
 
     Args:
         origin: (3,) float32.
         direction: (3,) float32, its largest component 1 to 2 in size.
-        reach: The largest coordinate of the scene.
+        frame: A `walk.Frame`.
     """
     size = jnp.abs(origin)
-    margin = MARGIN * larger(larger(size[0], size[1]), larger(size[2], reach))
+    margin = frame.margin * larger(larger(size[0], size[1]), larger(size[2], frame.reach))
     tiny = jnp.where(direction < 0, -TINY, TINY)
     inverse = 1 / jnp.where(jnp.abs(direction) < TINY, tiny, direction)
-    return Slab((origin + margin) * inverse, (origin - margin) * inverse, inverse)
+    low, high = origin + margin - frame.low, origin - margin - frame.low
+    return Slab(low * inverse, high * inverse, inverse * frame.unit)
 
 
 def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:
@@ -66,13 +70,15 @@ def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:
         slab: Of the ray.
         nearest: The distance beyond which a box does not matter.
     """
-    entries = []
-    exits = []
-    for axis in range(3):
-        a = boxes[axis] * slab.inverse[axis] - slab.low[axis]
-        b = boxes[axis + 3] * slab.inverse[axis] - slab.high[axis]
-        entries.append(smaller(a, b))
-        exits.append(larger(a, b))
+    low = [boxes[axis] * slab.inverse[axis] - slab.low[axis] for axis in range(3)]
+    high = [boxes[axis + 3] * slab.inverse[axis] - slab.high[axis] for axis in range(3)]
+    return passes(low, high, nearest)
+
+
+def passes(low: list[Array], high: list[Array], nearest: Array) -> Array:
+    """Whether a ray is inside on all axes at once: distances of low and of high sides, by axis."""
+    entries = [smaller(a, b) for a, b in zip(low, high, strict=True)]
+    exits = [larger(a, b) for a, b in zip(low, high, strict=True)]
     entry = larger(larger(entries[0], entries[1]), larger(entries[2], jnp.float32(0)))
     leaving = smaller(exits[0], smaller(exits[1], exits[2])) * FAR_FACTOR
     return entry <= smaller(nearest, leaving)

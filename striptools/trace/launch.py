@@ -11,8 +11,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import quiet_jax
-from striptools.trace.leaves import aligned_full
-from striptools.trace.walk_wide import WalkOptions, WideScene, trace_rays, walk_rays
+from striptools.trace.layout import Layout
+from striptools.trace.leaves import Rays, aligned_full
+from striptools.trace.walk import WalkOptions, WalkScene, trace_rays, walk_rays
 
 TILES = (2**8, 2**12, 2**16)
 """Rays a CPU device takes at once: few sizes, since each is compiled. A place not filled costs next to
@@ -36,7 +37,7 @@ def device_mesh(devices: list[jax.Device]) -> Mesh:
     return Mesh(np.array(devices), ("device",))
 
 
-def replicate(scene: WideScene, mesh: Mesh) -> WideScene:
+def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
     """Put a whole scene on each device."""
     with quiet_jax():
         return jax.device_put(scene, NamedSharding(mesh, _EVERYWHERE))
@@ -59,11 +60,8 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
     return jax.jit(split)
 
 
-Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
 def stream(
-    scene: WideScene, rays: Rays, mesh: Mesh, options: WalkOptions
+    scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
     """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
     compiled = program(mesh, options)
@@ -80,13 +78,13 @@ def stream(
 
 
 def stream_ready(
-    scene: WideScene, host: WideScene, rays: Rays, dropped: np.ndarray, mesh: Mesh, options: WalkOptions
+    scene: WalkScene, layout: Layout, rays: Rays, dropped: np.ndarray, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
     """Make rays ready on this side, trace those that meet a child of the root, and yield them in order.
 
     Args:
         scene: On the devices.
-        host: The same as NumPy arrays.
+        layout: The same on this side.
         rays: Origins, directions and t_max.
         dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
         mesh: The CPU devices.
@@ -109,12 +107,12 @@ def stream_ready(
         spare.append(buffers)
         return buffers[1][:live], results
 
-    root = _root(host)
+    seen = (tuple(layout.arrays.frame), *layout.root)
     begin = 0
     while begin < count:
         buffers = spare.pop() if spare else _ready_buffers(room * mesh.size)
         places = (buffers[0], buffers[0].view(np.int32), buffers[1])
-        live, begin = ready_rays(*rays, begin, *root, True, *places, dropped)
+        live, begin = ready_rays(*rays, begin, *seen, True, *places, dropped)
         if live:
             _, per_device = next(tiles(live, mesh.size, TILES))
             with quiet_jax():
@@ -129,12 +127,6 @@ def stream_ready(
 def _ready_buffers(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Places for ready rays, and for which ones they are."""
     return aligned_full((count, ROW), 0.0), np.zeros(count, np.int32)
-
-
-def _root(scene: WideScene) -> tuple[np.float32, np.float32, np.ndarray, np.ndarray]:
-    """Scale, reach, and the root's boxes and children."""
-    root = scene.nodes[0]
-    return scene.scale, scene.reach, root, root[6].view(np.int32)
 
 
 def tiles(count: int, devices: int, sizes: tuple[int, ...]) -> Iterator[tuple[slice, int]]:

@@ -1,4 +1,4 @@
-"""A scene laid out for the walk: wide nodes, leaf blocks, and the way from a face to its place."""
+"""A scene laid out for the walk, expanded: wide nodes, leaf blocks, and the way from a face to its place."""
 
 import math
 from dataclasses import dataclass
@@ -11,9 +11,11 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
-from striptools.kernels.wide import fill_leaf_blocks
+from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
 from striptools.partition.object_split import split_objects
-from striptools.trace.walk_wide import DONE, NO_FACE, WideScene
+from striptools.trace.box import MARGIN
+from striptools.trace.walk import DONE, NO_FACE, Frame
+from striptools.trace.walk_wide import WideScene
 
 if TYPE_CHECKING:
     from striptools.reducem.placed import Placed
@@ -21,10 +23,16 @@ if TYPE_CHECKING:
 
 CACHE_LINE = 64
 
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Origins (r, 3), directions (r, 3) and t_max (r,), float32."""
+
+Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""T, face, u, v and triangle of all rays, to be filled."""
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """What a tracer keeps of a scene.
+    """What a tracer keeps of an expanded scene.
 
     Attributes:
         arrays: For the device, as NumPy arrays.
@@ -38,12 +46,31 @@ class Layout:
     place: Int32[np.ndarray, " f"]
     triangle_of: Int32[np.ndarray, " f"]
     depth: int
+    decode: None = None
+
+    @property
+    def root(self) -> tuple[np.ndarray, np.ndarray]:
+        """(6, 8) float32 boxes of the root's children, NaN where there is none, and (8,) int32 children."""
+        node = self.arrays.nodes[0]
+        return node, node[6].view(np.int32)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        arrays = (self.arrays.nodes, self.arrays.blocks, self.place, self.triangle_of)
+        return sum(a.nbytes for a in arrays)
+
+    def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
+        arrays = self.arrays
+        given = (at, traced[0], traced[1], self.place, arrays.blocks, arrays.frame.scale, self.triangle_of)
+        weigh_hits(rays[0], rays[1], *given, *found)
 
 
-def lay_out(scene: "Scene") -> Layout:
-    """Lay a scene out for the walk through its own hierarchy, the boxes made exact."""
-    wide = wide_tree(scene.with_boxes(), scene.triangle_boxes(), scene.block_starts)
-    return lay_out_wide(scene, wide, np.arange(scene.triangle_count, dtype=np.int32))
+def lay_out(scene: "Scene", threads: int = 1) -> Layout:
+    """Lay a scene out for the walk through its own hierarchy."""
+    boxes = scene.triangle_boxes(threads)
+    return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
 def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
@@ -51,33 +78,22 @@ def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
     boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
     tree = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size)
-    return lay_out_tree(scene, tree, split.order)
+    return lay_out_wide(scene, collapse(tree), split.order)
 
 
-def lay_out_tree(
-    scene: "Scene | Placed", tree: BinaryTree, order: Int32[np.ndarray, " n"] | None = None
+def lay_out_wide(
+    scene: "Scene | Placed", wide: WideTree, order: Int32[np.ndarray, " n"] | None = None
 ) -> Layout:
-    """Lay a scene out for the walk through any binary hierarchy over its triangles.
-
-    Args:
-        scene: Whose triangles they are.
-        tree: A leaf for each triangle.
-        order: (n,) int32, the triangle in file order of each leaf; None where they are in file order.
-    """
-    triangle = np.arange(scene.triangle_count, dtype=np.int32) if order is None else order
-    return lay_out_wide(scene, collapse(tree), triangle)
-
-
-def lay_out_wide(scene: "Scene | Placed", wide: WideTree, triangle: Int32[np.ndarray, " n"]) -> Layout:
-    """Lay a scene out for the walk through an eight-wide hierarchy over its triangles.
+    """Lay a scene out for the walk through any wide hierarchy over its triangles.
 
     Args:
         scene: Whose triangles they are.
         wide: Its leaves are runs of places.
-        triangle: (n,) int32, the triangle in file order of each place.
+        order: (n,) int32, the triangle in file order at each place; None where they are in file order.
     """
     faces = scene.faces()
     ids, rotations = _names(scene, len(faces))
+    triangle = np.arange(len(faces), dtype=np.int32) if order is None else order
     faces, ids, rotations = faces[triangle], ids[triangle], rotations[triangle]
     scale = scale_of(scene)
     leaves = len(wide.leaf_first)
@@ -100,8 +116,9 @@ def lay_out_wide(scene: "Scene | Placed", wide: WideTree, triangle: Int32[np.nda
     triangle_of = np.full(face_count, -1, np.int32)
     triangle_of[ids] = triangle
     nodes = _nodes(wide, scale)
-    reach = np.float32(np.abs(scene.positions).max() * scale)
-    return Layout(WideScene(nodes, blocks, scale, reach), place, triangle_of, wide.depth)
+    zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
+    frame = Frame(scale, reach_of(scene, scale), zero, one, MARGIN)
+    return Layout(WideScene(nodes, blocks, frame), place, triangle_of, wide.depth)
 
 
 def _names(scene: "Scene | Placed", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
@@ -128,27 +145,44 @@ def scale_of(scene: "Scene | Placed") -> np.float32:
 
     Scaling by it is exact, and the model's unit no longer matters.
     """
-    largest = float(np.abs(scene.positions).max())
+    largest = _largest(scene)
     if largest < float(np.finfo(np.float32).tiny):
         return np.float32(1)
     exponent = int(np.floor(np.log2(largest)))
     return np.float32(2.0 ** -min(max(exponent, -126), 126))
 
 
-def size_class(count: int) -> int:
-    """The least of 1024, 1218, 1449, 1723, 2048, ... (four steps to each doubling) that is at least `count`.
+def reach_of(scene: "Scene | Placed", scale: np.float32) -> np.float32:
+    """The largest scaled coordinate."""
+    return np.float32(_largest(scene) * float(scale))
+
+
+def _largest(scene: "Scene | Placed") -> float:
+    """The largest coordinate."""
+    return float(np.abs([scene.low, scene.high]).max())
+
+
+def size_class(count: int, steps: int = 4) -> int:
+    """The least of 1024, 1218, 1449, 1723, 2048, ... (`steps` to each doubling) that is at least `count`.
 
     A program is compiled for the sizes of its arrays: scenes of the same class share it.
     """
-    quarters = 40
-    while (size := math.ceil(2 ** (quarters / 4))) < count:
-        quarters += 1
+    step = 10 * steps
+    while (size := math.ceil(2 ** (step / steps))) < count:
+        step += 1
     return size
 
 
 def aligned_full(shape: tuple[int, ...], value: float) -> np.ndarray:
     """A float32 array that starts at a cache line: CPU devices use such arrays where they lie, uncopied."""
-    count = int(np.prod(shape))
-    memory = np.full(count + CACHE_LINE // 4, value, np.float32)
-    start = -memory.ctypes.data % CACHE_LINE // 4
-    return memory[start : start + count].reshape(shape)
+    array = aligned_zeros(shape, np.float32)
+    array.fill(value)
+    return array
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+    """An array of zeros that starts at a cache line."""
+    length = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory = np.zeros(length + CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % CACHE_LINE
+    return memory[start : start + length].view(dtype).reshape(shape)

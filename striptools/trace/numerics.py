@@ -4,6 +4,8 @@ XLA's CPU backend contracts a product and a sum to one fused multiply-add whenev
 denormals, and has slow minimum and maximum operations. The functions here say what is meant.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -46,3 +48,11 @@ def power_of_two_below(a: Array) -> tuple[Array, Array]:
 def index(a: Array) -> Array:
     """An index that is known not to be negative: unsigned, so that XLA adds no case for negative ones."""
     return a.astype(jnp.uint32)
+
+
+def folded(values: Array, join: Callable[[Array, Array], Array]) -> Array:
+    """The lanes joined pairwise, a power of two of them: XLA makes a chain of a reduction."""
+    while len(values) > 1:
+        half = len(values) // 2
+        values = join(values[:half], values[half:])
+    return values[0]

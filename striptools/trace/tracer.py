@@ -8,17 +8,20 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from striptools.errors import StriptoolsError, UsageError
-from striptools.kernels.wide import weigh_hits
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.hit import Hits
-from striptools.trace.launch import Rays, device_mesh, replicate, stream, stream_ready
-from striptools.trace.leaves import Layout, lay_out, lay_out_rebuilt
-from striptools.trace.walk_wide import MISS, STUCK, WalkOptions
+from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
+from striptools.trace.layout import Layout
+from striptools.trace.leaves import Rays, lay_out, lay_out_rebuilt
+from striptools.trace.memory import EXPANDED_BYTES, free_memory
+from striptools.trace.packed import lay_out_packed
+from striptools.trace.walk import MISS, STUCK, WalkOptions
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
 HierarchyKind = Literal["stored", "rebuilt"]
+ResidentKind = Literal["auto", "expanded", "compressed"]
 
 RAYS_SIDE_BY_SIDE = 2
 """Rays that a CPU walks at once; more gain nothing, since their constants no longer fit the registers."""
@@ -48,10 +51,16 @@ class Tracer:
         device: "auto" takes a GPU where JAX has one.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
-            triangles first, which takes longer to build and is faster to walk. Hits are the same.
+            triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the same.
+        resident: "expanded" keeps boxes and corners as float32, 80 bytes a triangle; "compressed" keeps the
+            blocks as they are, a tenth of that, and decodes triangles where they are tested, which is
+            slower. Hits are the same. "auto" expands what fits in `memory_budget`.
+        memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
+            that is free on the device, or on this machine where the device does not tell.
 
     Raises:
-        UsageError: There is no such device or hierarchy.
+        UsageError: There is no such device, hierarchy or residency, or no rebuilt hierarchy that is compressed,
+            or the scene has instances, which are not traced compressed yet.
         LimitError: All instances have more triangles than a mesh may have.
     """
 
@@ -62,24 +71,38 @@ class Tracer:
         device: DeviceKind = "auto",
         threads: int | None = None,
         hierarchy: HierarchyKind = "stored",
+        resident: ResidentKind = "auto",
+        memory_budget: int | None = None,
     ) -> None:
-        if hierarchy not in ("stored", "rebuilt"):
-            raise UsageError(f"no such hierarchy: {hierarchy!r}", remedy="use stored or rebuilt")
+        _check_kinds(hierarchy, resident)
         devices = trace_devices(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         self._on_gpu = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
-        stored = hierarchy == "stored" and scene.instances is None
-        self._take(
-            lay_out(scene) if stored else lay_out_rebuilt(scene.placed(), self._builders(threads))
-        )
+        if scene.instances is not None:
+            resident, hierarchy = _of_instances(resident), "rebuilt"
+        if resident == "auto":
+            budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
+            fits = hierarchy == "rebuilt" or EXPANDED_BYTES * scene.triangle_count <= budget
+            resident = "expanded" if fits else "compressed"
+        self._resident: ResidentKind = resident
+        self._empty = scene.triangle_count == 0
+        if not self._empty:
+            self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
+
+    def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
+        if self._resident == "compressed":
+            return lay_out_packed(scene, threads)
+        if hierarchy == "stored":
+            return lay_out(scene, threads)
+        return lay_out_rebuilt(scene.placed(), threads)
 
     def _builders(self, threads: int | None) -> int:
         """Threads to build with: as many as trace on a CPU; beside a GPU, two unless one was asked for."""
         return min(2, threads or 2) if self._on_gpu else self._mesh.size
 
     def _take(self, layout: Layout) -> None:
-        self._layout = layout
+        self._layout: Layout = layout
         self._scene = replicate(layout.arrays, self._mesh)
         self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
 
@@ -92,6 +115,16 @@ class Tracer:
     def origin(self) -> np.ndarray:
         """(3,) float64: where the zero of the rays' frame lies in the source's; zeros where they are one."""
         return self._origin.copy()
+
+    @property
+    def resident(self) -> ResidentKind:
+        """How the scene is kept: "expanded" or "compressed"."""
+        return self._resident
+
+    @property
+    def resident_bytes(self) -> int:
+        """Bytes of all arrays kept for tracing."""
+        return 0 if self._empty else self._layout.nbytes
 
     def closest_hit(
         self,
@@ -119,26 +152,26 @@ class Tracer:
         face, triangle = np.full(count, MISS), np.full(count, MISS)
         dropped = np.zeros(count, np.uint8)
         counted = np.zeros(count if steps else 0, np.int32)
-        layout = self._layout
-        blocks, scale = layout.arrays.blocks, layout.arrays.scale
-        for at, traced in self._stream(rays, dropped, self._options(any_hit=False, steps=steps)):
+        found = (t, face, u, v, triangle)
+        for at, traced in self._stream(rays, dropped, any_hit=False, steps=steps):
             if steps:
-                counted[at] = traced[2]
+                counted[at] = traced[3]
             _check_ended(traced[1])
             # On this side, while the devices are at the next rays.
-            found_t, found_face = traced[:2]
-            found = (at, found_t, found_face, layout.place, blocks, scale, layout.triangle_of)
-            weigh_hits(rays[0], rays[1], *found, t, face, u, v, triangle)
+            self._layout.weigh(rays, at, traced, found)
         if steps:
             counted[dropped == 1] = 1
         return Hits(t, face, u, v, triangle, counted if steps else None)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, options: WalkOptions
+        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, steps: bool
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
+        if self._empty:
+            return
+        options = self._options(any_hit=any_hit, steps=steps)
         if not options.batch:
-            yield from stream_ready(self._scene, self._layout.arrays, rays, dropped, self._mesh, options)
+            yield from stream_ready(self._scene, self._layout, rays, dropped, self._mesh, options)
             return
         for part, traced in stream(self._scene, rays, self._mesh, options):
             yield np.arange(part.start, part.stop, dtype=np.int32), traced
@@ -150,14 +183,37 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, self._options(any_hit=True, steps=False)):
+        for at, traced in self._stream(rays, dropped, any_hit=True, steps=False):
             _check_ended(traced[1])
             hit[at] = traced[1] >= 0
         return hit
 
     def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
-        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, batch=self._on_gpu)
+        decode = self._layout.decode
+        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode)
+
+
+def _check_kinds(hierarchy: str, resident: str) -> None:
+    if hierarchy not in ("stored", "rebuilt"):
+        raise UsageError(f"no such hierarchy: {hierarchy!r}", remedy="use stored or rebuilt")
+    if resident not in ("auto", "expanded", "compressed"):
+        raise UsageError(f"no such residency: {resident!r}", remedy="use auto, expanded or compressed")
+    if hierarchy == "rebuilt" and resident == "compressed":
+        raise UsageError(
+            "a rebuilt hierarchy is expanded", where="resident", remedy="use the stored hierarchy"
+        )
+
+
+def _of_instances(resident: ResidentKind) -> ResidentKind:
+    """How a scene with instances is kept."""
+    if resident == "compressed":
+        raise UsageError(
+            "a scene with instances is not traced compressed yet",
+            where="resident",
+            remedy="use expanded, or convert it with its instances flattened",
+        )
+    return "expanded"
 
 
 def checked_rays(

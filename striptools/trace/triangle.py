@@ -25,7 +25,6 @@ Differences:
 Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -33,8 +32,8 @@ from jax import Array, lax
 
 from striptools.trace.numerics import SIGN, larger, rounded, smaller, with_sign_of
 
-CornerLoader = Callable[[Array], Array]
-"""Gives coordinate `axis` (uint32) of the three corners: (3,) of one triangle or (3, 8) of a leaf's lanes."""
+Corners = tuple[Array, Array, Array]
+"""One coordinate of the three corners a, b, c of a triangle, or (8,) each of a leaf's lanes."""
 
 
 class Shear(NamedTuple):
@@ -56,7 +55,7 @@ class Edges(NamedTuple):
     a: Array
     b: Array
     c: Array
-    heights: Array
+    heights: Corners
     around: Array
 
 
@@ -83,16 +82,17 @@ def pick(vector: Array, axis: Array) -> Array:
     return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
 
-def edges_of(corners: CornerLoader, shear: Shear) -> Edges:
-    """Edge functions of one triangle or of a block of them."""
-    x, y, z = (corners(axis) - start for axis, start in zip(shear.axes, shear.origin, strict=True))
-    ax, bx, cx = x - rounded(shear.x * z)
-    ay, by, cy = y - rounded(shear.y * z)
+def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear) -> Edges:
+    """Edge functions of one triangle or of a block of them, its coordinates along the axes of the shear."""
+    heights = [at - shear.origin[2] for at in z]
+    ax, bx, cx = (at - shear.origin[0] - rounded(shear.x * h) for at, h in zip(x, heights, strict=True))
+    ay, by, cy = (at - shear.origin[1] - rounded(shear.y * h) for at, h in zip(y, heights, strict=True))
+    a, b, c = (rounded(h * shear.z) for h in heights)
     return Edges(
         rounded(cx * by) - rounded(cy * bx),
         rounded(ax * cy) - rounded(ay * cx),
         rounded(bx * ay) - rounded(by * ax),
-        rounded(z * shear.z),
+        (a, b, c),
         _straddle(ax, bx, cx) & _straddle(ay, by, cy),
     )
 
@@ -102,15 +102,30 @@ def _straddle(a: Array, b: Array, c: Array) -> Array:
     return (smaller(smaller(a, b), c) <= 0) & (larger(larger(a, b), c) >= 0)
 
 
-def crossing_of(edges: Edges) -> Array:
+def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
     """Where along a ray its line goes through each triangle: positive and finite only where it does.
 
     The division comes last on purpose: XLA computes a division once, all that is cheap again for each use.
+
+    Args:
+        edges: Of the triangles.
+        turn: Which corner is the first in the canonical order; None where that is corner a.
     """
     a, b, c, heights, around = edges
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
-    determinant = a + b + c
-    scaled_t = rounded(a * heights[0]) + rounded(b * heights[1]) + rounded(c * heights[2])
+    determinant = _summed(a, b, c, turn)
+    scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
     return lax.optimization_barrier(scaled_t / with_sign_of(determinant, sign))
+
+
+def _summed(a: Array, b: Array, c: Array, turn: Array | None) -> Array:
+    """The sum in the canonical order: all that turning a triangle's corners changes, since it turns edges too.
+
+    Edges a, b, c of corners (a, b, c) are edges c, a, b of (b, c, a), bit for bit.
+    """
+    if turn is None:
+        return a + b + c
+    last = jnp.where(turn == 0, c, jnp.where(turn == 1, a, b))
+    return jnp.where(turn == 0, a, c) + jnp.where(turn == 2, a, b) + last

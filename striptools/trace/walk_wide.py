@@ -1,50 +1,14 @@
-"""The walk of rays through an eight-wide hierarchy: a function of a few rays, compiled to one native loop.
+"""A scene of float32 boxes and corners, as the walk sees it: expanded, the fastest and the largest."""
 
-Nodes, octant order and the stack of (node, lanes left) follow Ylitie, Karras & Laine, "Efficient Incoherent
-Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017), section 3.
-
-Differences:
-
-1. A few rays go side by side in one instruction stream, so that one's arithmetic fills the other's waits:
-   two on a CPU, one on a GPU. A ray that has reached a leaf, or its end, waits while another is at inner
-   nodes.
-2. Leaves are tested eight triangles at once, each lane keeping its own closest hit until the walk ends.
-3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
-   the same t the one of the smaller face is kept: the result does not depend on the order of visits.
-
-What the assembly taught: every value that a loop carries costs loads and stores in each turn; a stack
-inside a `lax.cond` is copied; a loop is hoisted only while nothing in it scatters, sorts or calls back.
-
-The steps of a walk are bounded: a tree that goes round in a circle ends in `STUCK`, not in a hang.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
-from striptools.trace.box import Slab, lanes_met, slab_of
-from striptools.trace.numerics import index, larger, power_of_two_below, smaller
-from striptools.trace.triangle import Shear, crossing_of, edges_of, shear_of
-
-WIDTH = 8
-FLOATS = 17
-"""Float32 words at the head of a ready ray; int32 words follow."""
-
-DONE = np.int32(-(2**31))
-"""The next child of a ray that has nothing left to visit."""
-
-MISS = np.int32(-1)
-STUCK = np.int32(-2)
-"""The face of a ray whose walk did not end within the bound."""
-
-NO_FACE = np.int32(2**31 - 1)
-SLACK = np.float32(1 + 2**-20)
+from striptools.trace.box import Slab, lanes_met
+from striptools.trace.numerics import index
+from striptools.trace.triangle import Shear, crossing_of, edges_of
+from striptools.trace.walk import WIDTH, Best, Frame, WalkOptions, closer_of
 
 
 class WideScene(NamedTuple):
@@ -55,359 +19,45 @@ class WideScene(NamedTuple):
             as in `WideTree`, `DONE` in empty lanes). The last node has no children.
         blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
             NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
-        scale: () float32, the power of two that positions were multiplied by.
-        reach: () float32, the largest scaled coordinate.
+        frame: How rays are seen: boxes are counted from zero, in ones.
     """
 
     nodes: Any
     blocks: Any
-    scale: Any
-    reach: Any
-
-
-class WalkOptions(NamedTuple):
-    """What is compiled in.
-
-    Attributes:
-        interleave: Rays that go side by side.
-        any_hit: End at the first hit.
-        count_steps: Count nodes and leaves visited.
-        stack_size: Entries of the stack: the depth of the tree and two more.
-        batch: Walk all rays at once by vmap (GPU), not one group after the other (CPU).
-    """
-
-    interleave: int
-    any_hit: bool
-    count_steps: bool
-    stack_size: int
-    batch: bool = False
-
-
-class Traced(NamedTuple):
-    """One entry a ray; what was not asked for has no entries."""
-
-    t: Array
-    face: Array
-    steps: Array
-
-
-class _Ray(NamedTuple):
-    """What stays the same all along a walk, in as few arrays as can be: a loop pays for each.
-
-    Attributes:
-        floats: (17,) float32: what the properties name.
-        ints: (7,) int32: axes of the shear, mirror, and where the walk starts: exclusive-or of `DONE` and
-            the child to visit first (zeros are a ray that is done), the root's lanes left, nodes visited.
-        lane_bits: (8,) int32, the bit that stands for each lane, the nearest highest.
-    """
-
-    floats: Array
-    ints: Array
-    lane_bits: Array
+    frame: Frame
 
     @property
-    def slab(self) -> Slab:
-        return Slab(self.floats[0:3], self.floats[3:6], self.floats[6:9])
+    def node_count(self) -> int:
+        """Nodes and those that fill up the size class."""
+        return len(self.nodes)
 
     @property
-    def shear(self) -> Shear:
-        x, y, z = (index(self.ints[k]) for k in range(3))
-        origin = (self.floats[9], self.floats[10], self.floats[11])
-        return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14])
+    def has_faces(self) -> bool:
+        """The way from a face to its triangle is on the host."""
+        return False
 
-    @property
-    def t_max(self) -> Array:
-        return self.floats[15]
+    def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
+        """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
+        at = (index(node), jnp.uint32(0), jnp.uint32(0))
+        return lanes_met(lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0], slab, limit)
 
-    @property
-    def t_unit(self) -> Array:
-        """T of the walk in units of the caller's t."""
-        return self.floats[16]
+    def child_of(self, node: Array, lane: Array) -> Array:
+        """The child in a lane; leaf q is -(q + 1)."""
+        bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
+        return lax.bitcast_convert_type(bits, jnp.int32)
 
-    @property
-    def mirror(self) -> Array:
-        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
-        return self.ints[3]
+    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
+        """Test the triangles of a leaf, each lane against its own closest hit."""
+        leaf = index(-(child + 1))
 
-    @property
-    def start(self) -> "_Place":
-        return _Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
+        def corners(axis: Array) -> tuple[Array, Array, Array]:
+            rows = lax.dynamic_slice(self.blocks, (leaf, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
+            return rows[0], rows[1], rows[2]
 
-    @property
-    def visited(self) -> Array:
-        """Nodes visited before the walk starts."""
-        return self.ints[6]
-
-
-class _Place(NamedTuple):
-    """Where a ray is: the child to visit next, and the lanes left of the node it came from."""
-
-    child: Array
-    node: Array
-    lanes: Array
-    height: Array
-
-
-class _Best(NamedTuple):
-    """The closest hit in each lane, and the closest of all, or t_max."""
-
-    nearest: Array
-    t: Array
-    face: Array
-
-
-def trace_rays(
-    scene: WideScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
-) -> Traced:
-    """Trace r rays, r a multiple of `options.interleave`.
-
-    Args:
-        scene: What to trace.
-        origins: (r, 3) float32.
-        directions: (r, 3) float32.
-        t_max: (r,) float32.
-        options: What to compile in.
-    """
-    return walk_rays(scene, prepared_rays(scene, origins, directions, t_max), options)
-
-
-def prepared_rays(scene: WideScene, origins: Array, directions: Array, t_max: Array) -> Array:
-    """Ready rays for the walk: (r, 24) float32, the floats and the bits of the ints of `_Ray`."""
-    floats, ints = jax.vmap(lambda *ray: _prepare(scene, *ray))(origins, directions, t_max)
-    return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)], axis=1)
-
-
-def walk_rays(scene: WideScene, ready: Array, options: WalkOptions) -> Traced:
-    """Walk r rays, r a multiple of `options.interleave`, made ready here or by `kernels.rays`.
-
-    Args:
-        scene: What to trace.
-        ready: (r, 24) float32, as from `prepared_rays`; rows of zeros are rays that end at once.
-        options: What to compile in.
-    """
-    rows = ready.reshape(len(ready) // options.interleave, options.interleave, -1)
-    end = len(scene.nodes) - 1
-
-    # The bottom of a stack is a node whose every child is DONE.
-    floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
-    stacks = (floor,) * options.interleave
-
-    def walk(stacks: tuple[Array, ...], group: Array) -> tuple[tuple[Array, ...], _Walked]:
-        return _walk_group(scene, group, stacks, options)
-
-    if options.batch:
-        walked = jax.vmap(lambda group: walk(stacks, group)[1])(rows)
-    else:
-        # One group's stacks serve the next: only their bottom is read before it is written.
-        walked = lax.scan(walk, stacks, rows)[1]
-    t, face, steps = (a.reshape(-1) for a in walked)
-    if options.any_hit:
-        t = jnp.zeros(0)
-    return Traced(t, face, steps)
-
-
-def _prepare(scene: WideScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
-    """Floats and ints of a `_Ray`.
-
-    A ray is scaled by powers of two: neither the model's unit nor the direction's length matters after that.
-    """
-    size = jnp.abs(direction)
-    longest = larger(larger(size[0], size[1]), size[2])
-    shorten, length = power_of_two_below(longest)
-    origin = origin * scene.scale
-    finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
-    valid = finite & (longest >= np.finfo(np.float32).tiny) & (t_max > 0)
-    direction = direction * shorten
-    mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
-    slab = slab_of(origin, direction, scene.reach)
-    shear = shear_of(origin, direction)
-    rest = [*shear.origin, shear.x, shear.y, shear.z, t_max * length * scene.scale, shorten / scene.scale]
-    floats = jnp.concatenate([slab.low, slab.high, slab.inverse, jnp.stack(rest)])
-    start = jnp.where(valid, DONE, 0)
-    zero = jnp.int32(0)
-    axes = (axis.astype(jnp.int32) for axis in shear.axes)
-    return floats, jnp.stack([*axes, mirror, start, zero, zero])
-
-
-def _next_child(
-    scene: WideScene, ray: _Ray, node: Array, lanes: Array, height: Array, stack: Array
-) -> _Place:
-    """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
-    empty = lanes == 0
-    height = jnp.where(empty, height - 1, height)
-    top = lax.dynamic_slice(stack, (index(height), jnp.uint32(0)), (1, 2))[0]
-    node = jnp.where(empty, top[0], node)
-    lanes = jnp.where(empty, top[1], lanes)
-    order = 31 - lax.clz(lanes)
-    at = (index(node), jnp.uint32(6), index(order ^ ray.mirror))
-    bits = lax.dynamic_slice(scene.nodes, at, (1, 1, 1))[0, 0, 0]
-    child = lax.bitcast_convert_type(bits, jnp.int32)
-    return _Place(child, node, lanes ^ (jnp.int32(1) << order), height)
-
-
-def _visit_node(
-    scene: WideScene, ray: _Ray, place: _Place, limit: Array, stack: Array
-) -> tuple[_Place, Array]:
-    """Put what is left of the last node on the stack, test this one's boxes, and choose the next child."""
-    entry = jnp.stack([place.node, place.lanes])[None]
-    stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
-    height = jnp.where(place.lanes != 0, place.height + 1, place.height)
-    at = (index(place.child), jnp.uint32(0), jnp.uint32(0))
-    boxes = lax.dynamic_slice(scene.nodes, at, (1, 6, WIDTH))[0]
-    lanes = jnp.sum(jnp.where(lanes_met(boxes, ray.slab, limit), ray.lane_bits, 0))
-    there = _next_child(scene, ray, place.child, lanes, height, stack)
-    # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
-    active = place.child >= 0
-    return _Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
-
-
-def _visit_leaf(scene: WideScene, ray: _Ray, child: Array, best: _Best) -> _Best:
-    """Test the triangles of a leaf, each lane against its own closest hit."""
-    leaf = index(-(child + 1))
-
-    def corners(axis: Array) -> Array:
-        return lax.dynamic_slice(scene.blocks, (leaf, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
-
-    t = crossing_of(edges_of(corners, ray.shear))
-    bits = lax.dynamic_slice(scene.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
-    face = lax.bitcast_convert_type(bits, jnp.int32)
-    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.face)))
-    t = jnp.where(closer, t, best.t)
-    face = jnp.where(closer, face, best.face)
-    nearest = t
-    while len(nearest) > 1:
-        half = len(nearest) // 2
-        nearest = smaller(nearest[:half], nearest[half:])
-    return _Best(nearest[0], t, face)
-
-
-def _closest_face(best: _Best) -> Array:
-    """The least face of the lanes that hold the closest hit; `MISS` where none does."""
-    face = jnp.where((best.t == best.nearest) & (best.face >= 0), best.face, NO_FACE)
-    while len(face) > 1:
-        half = len(face) // 2
-        face = smaller(face[:half], face[half:])
-    return jnp.where(face[0] == NO_FACE, MISS, face[0])
-
-
-class _Walked(NamedTuple):
-    """One entry for each ray of a group; `steps` has none where they are not counted."""
-
-    t: Array
-    face: Array
-    steps: Array
-
-
-class _State(NamedTuple):
-    """Where the rays of a group are: what an inner loop carries. It counts its turns, and steps of a ray."""
-
-    places: tuple[_Place, ...]
-    stacks: tuple[Array, ...]
-    turns: Array
-    steps: tuple[Array, ...]
-
-
-@dataclass(frozen=True)
-class _Walk:
-    """The steps of the walk of one group of rays."""
-
-    scene: WideScene
-    rays: tuple[_Ray, ...]
-    options: WalkOptions
-
-    def goes_on(self, state: _State, at: Callable[[_Place], Array]) -> Array:
-        """Whether any ray is `at` a place, and the walk within its bound: each ray at each node once."""
-        found = jnp.bool_(False)
-        for place in state.places:
-            found = found | at(place)
-        return found & (state.turns <= len(self.rays) * len(self.scene.nodes))
-
-    def visit_nodes(self, state: _State, bests: tuple[_Best, ...]) -> _State:
-        """Each ray that is at an inner node visits it."""
-        visits = [
-            _visit_node(self.scene, *each)
-            for each in zip(
-                self.rays, state.places, [best.nearest * SLACK for best in bests], state.stacks, strict=True
-            )
-        ]
-        places, stacks = tuple(v[0] for v in visits), tuple(v[1] for v in visits)
-        at_node = [place.child >= 0 for place in state.places]
-        return _State(places, stacks, state.turns + 1, self.count(state.steps, at_node))
-
-    def visit_leaves(self, state: _State, bests: tuple[_Best, ...]) -> tuple[_State, tuple[_Best, ...]]:
-        """Each ray that is at a leaf tests it and goes on."""
-        at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
-        after = [
-            lax.cond(
-                at_leaf[k],
-                partial(self.leave_leaf, k, state, bests[k]),
-                partial(self.stay, k, state, bests[k]),
-            )
-            for k in range(len(self.rays))
-        ]
-        steps = self.count(state.steps, at_leaf)
-        return state._replace(places=tuple(a[0] for a in after), steps=steps), tuple(a[1] for a in after)
-
-    def leave_leaf(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
-        """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
-        ray, place = self.rays[k], state.places[k]
-        best = _visit_leaf(self.scene, ray, place.child, best)
-        there = _next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
-        if self.options.any_hit:
-            there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
-        return there, best
-
-    def stay(self, k: int, state: _State, best: _Best) -> tuple[_Place, _Best]:
-        """Ray k is at no leaf."""
-        return state.places[k], best
-
-    def count(self, steps: tuple[Array, ...], there: list[Array]) -> tuple[Array, ...]:
-        """Add a step to each ray that took one, where steps are counted."""
-        return tuple(step + moved for step, moved in zip(steps, there, strict=True)) if steps else ()
-
-
-def _walk_group(
-    scene: WideScene, group: Array, stacks: tuple[Array, ...], options: WalkOptions
-) -> tuple[tuple[Array, ...], _Walked]:
-    """Walk `options.interleave` rays side by side."""
-    lanes = jnp.arange(WIDTH, dtype=jnp.int32)
-    floats = [row[:FLOATS] for row in group]
-    words = [lax.bitcast_convert_type(row[FLOATS:], jnp.int32) for row in group]
-    rays = tuple(
-        _Ray(real, ints, jnp.int32(1) << (lanes ^ ints[3])) for real, ints in zip(floats, words, strict=True)
-    )
-    walk = _Walk(scene, rays, options)
-    zero = jnp.int32(0)
-    places = tuple(ray.start for ray in rays)
-    bests = tuple(
-        _Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
-    )
-    steps = tuple(ray.visited for ray in rays) if options.count_steps else ()
-
-    def nodes_then_leaves(carried: tuple[_State, tuple[_Best, ...]]) -> tuple[_State, tuple[_Best, ...]]:
-        state, bests = carried
-        state = lax.while_loop(
-            lambda s: walk.goes_on(s, lambda place: place.child >= 0),
-            lambda s: walk.visit_nodes(s, bests),
-            state,
-        )
-        return walk.visit_leaves(state, bests)
-
-    state, bests = lax.while_loop(
-        lambda carried: walk.goes_on(carried[0], lambda place: place.child != DONE),
-        nodes_then_leaves,
-        (_State(places, stacks, zero, steps), bests),
-    )
-    results = [_result(*each) for each in zip(rays, state.places, bests, strict=True)]
-    t, face = (jnp.stack([r[k] for r in results]) for k in range(2))
-    return state.stacks, _Walked(t, face, jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0)))
-
-
-def _result(ray: _Ray, place: _Place, best: _Best) -> tuple[Array, Array]:
-    """What is reported of a ray: t in the caller's units, and the face."""
-    face = _closest_face(best)
-    t = jnp.where(face < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
-    return t, jnp.where(place.child != DONE, STUCK, face)
+        t = crossing_of(edges_of(*(corners(axis) for axis in shear.axes), shear))
+        bits = lax.dynamic_slice(self.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
+        face = lax.bitcast_convert_type(bits, jnp.int32)
+        return closer_of(best, t, face, face)
 
 
 # Notes

@@ -83,6 +83,7 @@ def valid_plans() -> dict[str, tuple[str, Plan]]:
         "empty_metadata": ("an empty scene with metadata", Plan([], metadata={"unit": "m"})),
         "triangle": ("one triangle", Plan([TRIANGLE])),
         "two_blocks": ("two blocks, boxes rebuilt", Plan(blocks_of(2))),
+        "worked_example": ("the example of SPEC.md, section 9", worked_example()),
         "error_bound": ("a bound, and all the source faces there may be", _bound()),
     }
     for group in (_turns(), _limits(), _widths(), _exponents(), _floats(), _boxes(), _containers(), _sides()):
@@ -90,6 +91,22 @@ def valid_plans() -> dict[str, tuple[str, Plan]]:
     for group in (_attributes(), _origins()):
         made |= group
     return made
+
+
+def worked_example() -> Plan:
+    """The scene whose bytes stand in the specification."""
+    first = [(0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.0, 2.0, 1.0), (1.5, 2.0, 1.0), (0.5, 4.0, 1.0)]
+    second = [(2.5, -0.0, 1.0), (3.5, 0.0, 1.0), (2.5, 2.0, 1.0), (3.5, 2.0, 1.25)]
+    blocks = [Block([Strip([0, 1, 2, 3, 4], "10")], first), Block([Strip([0, 1, 2, 3], "0", "1")], second)]
+    left, right = Slot(False, (0, 0, 0), (6, 8, 0)), Slot(False, (10, 0, 0), (14, 8, 1))
+    nodes = [
+        Node([left, right]),
+        Node([left]),
+        Node([Slot(False, (0, 0, 0), (4, 8, 1))], leaves=1, origin=(10, 0, 0)),
+    ]
+    fields = {"source_face_count": 6, "longest_run": 3, "cell_x": -2, "cell_y": -1, "cell_z": -2}
+    remap = [(0, 0), (2, 1), (1, 0), (4, 2), (5, 0)]
+    return Plan(blocks, stored=True, nodes=nodes, remap=remap, record=fields)
 
 
 def _bound() -> Plan:

@@ -268,10 +268,12 @@ def cut_runs(blocks: list[Block], longest: int = 8) -> list[list[tuple[int, int]
     return runs
 
 
-def plain_nodes(blocks: list[Block], runs: list[list[tuple[int, int]]] | None) -> list[Node]:
-    """Nodes of up to eight neighbours, for whole coordinates that spread no more than 255 and cells of 1."""
+def plain_nodes(
+    blocks: list[Block], runs: list[list[tuple[int, int]]] | None, cells: tuple[int, int, int] = (0, 0, 0)
+) -> list[Node]:
+    """Nodes of up to eight neighbours, for coordinates that spread over no more than 255 cells."""
     low = scene_bounds(blocks)[:3]
-    block_boxes = [unit_box(block.points, low) for block in blocks]
+    block_boxes = [cell_box(block.points, low, cells) for block in blocks]
     top = [Node([])] if len(blocks) > 1 else []
     if top:
         grow(top, 0, 0, block_boxes, None)
@@ -281,7 +283,7 @@ def plain_nodes(blocks: list[Block], runs: list[list[tuple[int, int]]] | None) -
     for i, (block, here) in enumerate(zip(blocks, runs, strict=True)):
         faces = [face for strip in block.strips for face in walk(strip)]
         corners = [{v for face in faces[first : first + count] for v in face} for first, count in here]
-        boxes = [unit_box([block.points[v] for v in run], low) for run in corners]
+        boxes = [cell_box([block.points[v] for v in run], low, cells) for run in corners]
         grow(nodes, len(top) + i, 0, boxes, i)
     return nodes
 
@@ -301,10 +303,21 @@ def grow(nodes: list[Node], at: int, first: int, boxes: list, block: int | None)
         grow(nodes, base + i, first + i * size, part, block)
 
 
-def unit_box(points: list, low: list[float]) -> tuple[tuple, tuple]:
-    """The bytes of the box of points in cells of 1."""
-    sides = [[int(p[axis] - low[axis]) for p in points] for axis in range(3)]
-    return tuple(min(side) for side in sides), tuple(max(side) for side in sides)
+def cell_box(points: list, low: list[float], cells: tuple[int, int, int]) -> tuple[tuple, tuple]:
+    """The bytes of the box of points, in whole cells around them."""
+    sides = [
+        [(Fraction(p[axis]) - Fraction(low[axis])) / Fraction(2) ** cells[axis] for p in points]
+        for axis in range(3)
+    ]
+    return tuple(math.floor(min(side)) for side in sides), tuple(math.ceil(max(side)) for side in sides)
+
+
+def fitting_cells(blocks: list[Block]) -> tuple[int, int, int]:
+    """The finest cells of which the scene is no more than 255 wide."""
+    bounds = [Fraction(bound) for bound in scene_bounds(blocks)]
+    spreads = [(high - low) * 2**149 for low, high in zip(bounds[:3], bounds[3:], strict=True)]
+    x, y, z = (max(0, int(spread / 255).bit_length()) - 149 for spread in spreads)
+    return x, y, z
 
 
 def union(boxes: list) -> tuple[tuple, tuple]:
@@ -390,6 +403,7 @@ class Plan:
         materials: An array, or the bytes of MATL.
         metadata: An object, or the bytes of META.
         grid: The grid exponent.
+        cells: The exponents of the cells of plain nodes.
         record: Fields of SCEN that hold something else.
         payloads: For a kind, what is done to the bytes of the section before it is written.
         packed: For a kind, what makes its stored bytes, which get codec 1.
@@ -412,6 +426,7 @@ class Plan:
     materials: list | bytes | None = None
     metadata: dict | bytes | None = None
     grid: int | None = None
+    cells: tuple[int, int, int] = (0, 0, 0)
     record: dict = field(default_factory=dict)
     payloads: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
     packed: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
@@ -429,9 +444,9 @@ class Plan:
             self.runs = cut_runs(self.blocks)
         if self.nodes is None:
             wanted = self.stored or len(self.blocks) > 1
-            self.nodes = plain_nodes(self.blocks, self.runs) if wanted else []
+            self.nodes = plain_nodes(self.blocks, self.runs, self.cells) if wanted else []
         if self.top is None:
-            plain = len(plain_nodes(self.blocks, None)) if len(self.blocks) > 1 else 0
+            plain = len(plain_nodes(self.blocks, None, self.cells)) if len(self.blocks) > 1 else 0
             self.top = min(plain, len(self.nodes))
 
     @property
@@ -532,9 +547,7 @@ def scene_record(plan: Plan) -> dict:
         "reserved_2": 0,
         "error_bound": 0.0,
         **dict(zip(names, bounds, strict=True)),
-        "cell_x": 0,
-        "cell_y": 0,
-        "cell_z": 0,
+        **dict(zip(("cell_x", "cell_y", "cell_z"), plan.cells, strict=True)),
         "longest_run": 8 if plan.stored else 0,
         "origin_x": 0.0,
         "origin_y": 0.0,
