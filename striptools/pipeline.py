@@ -48,8 +48,9 @@ class Options:
         boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
         geometry_only: Leave out normals, texture coordinates, colours, groups and materials.
-        instances: Store a mesh that a glTF scene has in several places once, with a matrix for each; a grid
-            is then one for all such geometries, in their own frames, and errors are told there.
+        instances: Store a mesh that a glTF scene has in several places once, with a matrix for each. A grid is
+            then one for all geometries, in their own frames, as fine as the largest stretch asks for; the
+            bound that a scene declares is told in those frames too.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:

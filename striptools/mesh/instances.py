@@ -93,6 +93,11 @@ class Instances:
         return zip(self.geometry.tolist(), self.matrix, strict=True)
 
     @property
+    def stretch(self) -> float:
+        """By how much the most stretching of them lengthens a distance, at most."""
+        return float(np.linalg.norm(self.matrix[:, :, :3], ord=2, axis=(1, 2)).max()) * (1 + 2.0**-20)
+
+    @property
     def mirrored(self) -> np.ndarray:
         """`(k,)` bool: which turn the winding of their faces."""
         return determinant_signs(self.matrix) < 0
@@ -185,6 +190,21 @@ def reach(matrix: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         x, y, z = np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
         m = np.abs(matrix)
         return (((m[:, :, 0] * x + m[:, :, 1] * y) + m[:, :, 2] * z) + m[:, :, 3]).max(axis=1)
+
+
+def placed_bounds(positions: np.ndarray, geometries: Geometries, instances: Instances) -> np.ndarray:
+    """The least and the largest corner of the boxes of all instances, `(2, 3)` float64, in their places."""
+    sides = np.zeros((len(geometries), 2, 3))
+    for geometry in range(len(geometries)):
+        part = positions[geometries.vertices(geometry)]
+        finite = part[np.isfinite(part).all(axis=1)]
+        if len(finite):
+            sides[geometry] = finite.min(axis=0), finite.max(axis=0)
+    middle, half = sides.sum(axis=1) / 2, (sides[:, 1] - sides[:, 0]) / 2
+    matrix = instances.matrix[:, :, :3]
+    centre = np.einsum("kij,kj->ki", matrix, middle[instances.geometry]) + instances.matrix[:, :, 3]
+    size = np.einsum("kij,kj->ki", np.abs(matrix), half[instances.geometry])
+    return np.stack([(centre - size).min(axis=0), (centre + size).max(axis=0)])
 
 
 def placed_positions(positions: np.ndarray, geometries: Geometries, instances: Instances) -> np.ndarray:

@@ -83,8 +83,8 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
 
     Positions are written as float32, bit for bit where they are float32; PLY and OBJ hold float64 too where
     they are that. STL has no shared vertices. Attributes are written where the format can hold them, vertices
-    split where it must be: `unkept` says what it cannot. GLB keeps instances, others are written flattened. An OBJ file with materials gets a file of its name
-    and .mtl beside it, where `target` is a path.
+    split where it must be: `unkept` says what it cannot. GLB keeps instances, other formats are written
+    flattened. An OBJ file with materials gets a file of its name and .mtl beside it, where `target` is a path.
 
     Args:
         mesh: What to write.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from striptools.hierarchies.packed import NodeWords, Roots, join_tops
-from striptools.mesh.instances import FARTHEST, Geometries, Instances, reach
+from striptools.mesh.instances import FARTHEST, Geometries, placed_bounds, reach
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import LEAST_GAIN
 from striptools.reducem.geometries import SceneGeometries, SceneInstances
@@ -94,21 +94,6 @@ def why_not_kept(mesh: Mesh) -> str | None:
         return "they are too many"
     if not reach(matrix, *np.abs(bounds)).max() <= FARTHEST / 2:
         return "they reach too far for float32"
-    low, high = _placed_bounds(mesh, mesh.geometries, mesh.instances)
+    low, high = placed_bounds(mesh.positions, mesh.geometries, mesh.instances)
     far = np.maximum(np.abs(low), np.abs(high)).max() >= LEAST_GAIN * (high - low).max() / 2
     return "the scene is far from zero" if far else None
-
-
-def _placed_bounds(mesh: Mesh, geometries: Geometries, instances: Instances) -> tuple[np.ndarray, np.ndarray]:
-    """The bounds of the placed bounds of all geometries, (3,) float64 each."""
-    sides = np.zeros((len(geometries), 2, 3))
-    for geometry in range(len(geometries)):
-        part = mesh.positions[geometries.vertices(geometry)]
-        finite = part[np.isfinite(part).all(axis=1)]
-        if len(finite):
-            sides[geometry] = finite.min(axis=0), finite.max(axis=0)
-    middle, half = sides.sum(axis=1) / 2, (sides[:, 1] - sides[:, 0]) / 2
-    matrix = instances.matrix[:, :, :3]
-    centre = np.einsum("kij,kj->ki", matrix, middle[instances.geometry]) + instances.matrix[:, :, 3]
-    size = np.einsum("kij,kj->ki", np.abs(matrix), half[instances.geometry])
-    return (centre - size).min(axis=0), (centre + size).max(axis=0)

@@ -83,7 +83,7 @@ def place_scene(scene: Scene) -> Placed:
         LimitError: Where they have more triangles than a mesh may have.
     """
     assert scene.instances is not None
-    if _source_face_count(scene) > 2**31 - 1:
+    if scene.remap is not None and _source_face_count(scene) > 2**31 - 1:
         raise LimitError("the source has more than 2^31 - 1 faces with all instances", remedy="split it")
     spans, instances = scene.spans, scene.instances.placed
     triangles = placed_faces(scene.faces(), spans, instances, MOST_FACES)
@@ -130,9 +130,8 @@ def _bound(error_bound: float, positions: np.ndarray, instances: Instances) -> f
     """How far placed positions may be off: by the longest stretch, and by the rounding of both sides."""
     if error_bound == 0.0:
         return 0.0
-    stretch = float(np.linalg.norm(instances.matrix[:, :, :3], ord=2, axis=(1, 2)).max())
     rounding = math.sqrt(3.0) * float(np.abs(positions).max(initial=0.0)) * 2.0**-23
-    return (error_bound * stretch + rounding) * SLACK
+    return (error_bound * instances.stretch + rounding) * SLACK
 
 
 def _source_face_count(scene: Scene) -> int:

@@ -19,14 +19,17 @@ from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.issues import ISSUES, Finding
 from striptools.reducem.validate_attributes import inspect_attributes, inspect_materials
 from striptools.reducem.validate_blocks import inspect_blocks
+from striptools.reducem.validate_instances import inspect_geometries, inspect_instances, inspect_owners
 from striptools.reducem.validate_nodes import inspect_nodes
 from striptools.reducem.validate_packed import unpack
 
 __all__ = ["validate"]
 
-_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
-_OPTIONAL = ("RMAP", "ATTR", "MATL", "META")
-_KNOWN = (*_NEEDED, *_OPTIONAL)
+_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
+_PASSED_OVER = ("RMAP", "ATTR", "MATL", "META")
+_KNOWN = (*_NEEDED, *_PASSED_OVER)
+_OPTIONAL = (*_PASSED_OVER, "GEOM", "INST")
+_RAW = ("SCEN", "INST")
 _MOST_METADATA = 2**20
 _MOST_MATERIALS = 2**24
 _TOO_LONG = {"META": "RDM902", "MATL": "RDM532"}
@@ -159,7 +162,7 @@ def _entry(inspection: Inspection, entry: _Entry) -> None:
         inspection.found("RDM118", entry.place, entry.at + 24)
     if entry.kind in _KNOWN and entry.codec > 1:
         inspection.found("RDM119", entry.place, entry.at + 6)
-    if entry.kind == "SCEN" and entry.codec != 0:
+    if entry.kind in _RAW and entry.codec != 0:
         inspection.found("RDM120", entry.place, entry.at + 6)
     if zlib.crc32(inspection.data[entry.offset : entry.end]) != entry.stored_checksum:
         inspection.found("RDM110", entry.place, entry.at + 32)
@@ -198,6 +201,7 @@ def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str
     lengths |= {"NODE": (64 * m, 64 * m), "RUNS": (runs, runs)}
     lengths |= {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
     beside = {"ATTR": (1, 256 * (n + 1)), "MATL": (1, _MOST_MATERIALS)}
+    beside |= {"GEOM": (16, 16 * b), "INST": (104, 104 * 2**24)}
     return lengths | (beside if n else dict.fromkeys(beside, (0, 0)))
 
 
@@ -209,6 +213,8 @@ def _decode(inspection: Inspection, entry: _Entry, lengths: tuple[int, int]) -> 
     if not lengths[0] <= entry.raw_length <= lengths[1]:
         return inspection.found(_TOO_LONG.get(entry.kind, "RDM114"), entry.place, entry.at + 24)
     payload = inspection.data[entry.offset : entry.end]
+    if entry.kind in _RAW and entry.codec != 0:
+        return None
     if entry.codec == 1:
         code, payload = unpack(payload, entry.raw_length)
         if code:
@@ -225,12 +231,16 @@ def _contents(inspection: Inspection) -> bool:
     """Look into the sections, each where it and what it leans on are whole."""
     sections = inspection.sections
     _record(inspection, sections["SCEN"])
+    parts = inspect_geometries(inspection)
     if "BLKH" in sections:
         geometry = inspect_blocks(inspection) if "BLKD" in sections else None
-        if "NODE" in sections:
-            inspect_nodes(inspection, geometry)
+        if "NODE" in sections and parts is not None:
+            inspect_nodes(inspection, geometry, parts)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])
+        inspect_owners(inspection, parts)
+    if "INST" in sections:
+        inspect_instances(inspection)
     _beside(inspection)
     if "META" in sections:
         _metadata(inspection, sections["META"])
@@ -254,14 +264,14 @@ def _record(inspection: Inspection, section: Section) -> None:
     n, b, m, top, r, source_faces, flags, reserved, grid = struct.unpack_from("<6IBBh", section.data)
     reserved_2 = section.data[28:32] != bytes(4)
     *cells, longest = struct.unpack_from("<3hH", section.data, 64)
-    stored = flags & 1
+    stored, several = flags & 1, "GEOM" in inspection.sections or "GEOM" in inspection.undecoded
     for at, wrong in ((24, flags > 7), (25, reserved), (28, reserved_2)):
         if wrong:
             inspection.found("RDM107", "SCEN", section.at(at))
     counts = (
         (4, b > 2**24 or (b == 0) != (n == 0) or not b <= n <= 256 * b),
         (8, m > 2**28 or (m < top + b if stored else m != top)),
-        (12, (top == 0) != (b < 2)),
+        (12, top > 0 if b < 2 else top == 0 and not several),
         (16, not b <= r <= n if stored else r),
         (20, source_faces < n),
     )
