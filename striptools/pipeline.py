@@ -48,8 +48,8 @@ class Options:
         boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
         geometry_only: Leave out normals, texture coordinates, colours, groups and materials.
-        instances: Store a mesh that a glTF scene has in several places once, with a matrix for each. A grid is
-            then one for all geometries, in their own frames, as fine as the largest stretch asks for; the
+        instances: Store a mesh that a glTF scene has in several places once, with a matrix for each. A grid
+            is then one for all geometries, in their own frames, as fine as the largest stretch asks for; the
             bound that a scene declares is told in those frames too.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
@@ -228,9 +228,7 @@ def open(source: str | Path | IO[bytes]) -> Scene:
 def _loaded(source: Mesh | str | Path | IO[bytes], file_format: str | None, options: Options) -> Mesh:
     """The mesh, with instances where they are asked for and can be kept."""
     keep = options.instances
-    mesh = (
-        source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
-    )
+    mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
     mesh = _geometry(mesh) if options.geometry_only else mesh
     if keep and mesh.instances is not None:
         reason = why_not_kept(mesh)

@@ -396,7 +396,9 @@ def _arrow(source: Source, target: Target) -> str:
 
 
 def _density(scene: Scene) -> str:
-    placed = "" if scene.instances is None else f", {scene.placed_count:,} in {len(scene.instances):,} instances"
+    placed = (
+        "" if scene.instances is None else f", {scene.placed_count:,} in {len(scene.instances):,} instances"
+    )
     return (
         f"{scene.triangle_count:,} triangles{placed}, "
         f"{len(scene.vertices) / scene.triangle_count:.2f} vertices per triangle, "

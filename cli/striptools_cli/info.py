@@ -23,9 +23,9 @@ def run(
     (`vertex_duplication`: how often on the average), `vertices_per_triangle` the entries of the strips: n + 2
     for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
     what tracing needs, so every part but the remap and attributes, before compression;
-    `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all. Where a
-    scene has instances all of that is of the geometries, stored once; `placed_triangles` are those of all
-    instances.
+    `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all.
+    Where a scene has instances all of that is of the geometries, stored once; `placed_triangles` are those
+    of all instances.
     """
     log.set_up()
     file = Source.open(source)

@@ -229,7 +229,8 @@ def _where_it_stands(scene: Scene, placed: Scene | Placed, source: Mesh) -> tupl
     apart = scene.instances is not None and source.instances is not None
     source = source if apart else source.flattened()
     expected = scene.source_face_count if apart else placed.source_face_count
-    fits = source.triangle_count == expected or (placed is not scene and source.triangle_count > expected)
+    more = placed is not scene and not apart and source.triangle_count > expected
+    fits = source.triangle_count == expected or more
     if scene.remap is not None and not fits:
         raise UsageError(
             f"the source has {source.triangle_count} faces, the scene's had {expected}",

@@ -35,7 +35,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from striptools.errors import UsageError
-from striptools.mesh.attributes import Attribute, follow
+from striptools.mesh.attributes import Attribute, Domain, follow
 from striptools.mesh.instances import Geometries
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import Origin, recentred
@@ -199,16 +199,16 @@ def _joined(mesh: Mesh, parts: list[Cleaned]) -> Cleaned:
 def _joined_attributes(parts: list[Mesh]) -> tuple[Attribute, ...]:
     """The attributes of meshes one after another, of corners where some are and others are not."""
     found = []
-    for name in [one.name for one in parts[0].attributes]:
-        own = [(one, part.faces) for part in parts for one in part.attributes if one.name == name]
-        domains = {one.domain for one, faces in own if len(faces)}
-        domain = domains.pop() if len(domains) == 1 else "corner" if domains else own[0][0].domain
+    for k, first in enumerate(parts[0].attributes):
+        own = [(part.attributes[k], part.faces) for part in parts]
+        domains: set[Domain] = {one.domain for one, faces in own if len(faces)}
+        domain = domains.pop() if len(domains) == 1 else "corner" if domains else first.domain
         rows = [
             one.values if one.domain == domain else one.at_corners(faces)
             for one, faces in own
             if len(faces) or one.domain == domain
         ]
-        found.append(Attribute(name, domain, np.concatenate(rows)))
+        found.append(Attribute(first.name, domain, np.concatenate(rows)))
     return tuple(found)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float64
 
 from striptools.errors import LimitError, UsageError
 from striptools.mesh.attributes import Attribute, turn_normals
@@ -68,14 +68,16 @@ class Instances:
         UsageError: Where a shape is another one, or a matrix none of these.
     """
 
-    geometry: Int32[np.ndarray, " k"]
+    geometry: Counts
     matrix: Matrices
 
     def __post_init__(self) -> None:
         geometry = np.ascontiguousarray(self.geometry, np.int32)
         matrix = np.ascontiguousarray(self.matrix, np.float64)
         if geometry.ndim != 1 or matrix.shape != (len(geometry), 3, 4) or len(geometry) == 0:
-            raise UsageError(f"matrices have shape {matrix.shape}", where="instances", remedy="give (k, 3, 4)")
+            raise UsageError(
+                f"matrices have shape {matrix.shape}", where="instances", remedy="give (k, 3, 4)"
+            )
         wrong = np.flatnonzero(~np.isfinite(matrix).all(axis=(1, 2)))
         if len(wrong):
             raise UsageError(f"the matrix of instance {wrong[0]} is not finite", where="instances")
@@ -106,7 +108,7 @@ class Instances:
 def check_instances(
     geometries: Geometries | None, instances: Instances | None, vertices: int, faces: np.ndarray
 ) -> None:
-    """Raise `UsageError` where geometries or instances do not fit a mesh of so many vertices, and its faces."""
+    """Raise `UsageError` where geometries or instances do not fit a mesh of these vertices and faces."""
     if (geometries is None) != (instances is None):
         raise UsageError("geometries without instances, or the other way round", where="instances")
     if geometries is None or instances is None:
@@ -141,7 +143,7 @@ def determinant_signs(matrix: np.ndarray) -> np.ndarray:
         sure = (np.abs(value) > np.maximum(SURE * size, LEAST_SURE)) & np.isfinite(size)
     signs = np.where(sure, np.sign(np.where(sure, value, 0)), 0).astype(np.int8)
     for row in np.flatnonzero(~sure):
-        signs[row] = _exact_sign(matrix[row])
+        signs[row] = _exact_sign(matrix[row, :3])
     return signs
 
 

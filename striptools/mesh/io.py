@@ -40,8 +40,8 @@ def load_mesh(
     """Read a mesh file.
 
     Scenes of several meshes or instances are flattened into one mesh with their transforms applied, and a
-    note says so, unless `instances` are to be kept. Positions are float32 where the file holds float32 (or text that float32 holds exactly),
-    else float64.
+    note says so, unless `instances` are to be kept. Positions are float32 where the file holds float32 (or
+    text that float32 holds exactly), else float64.
 
     Args:
         source: A path, or an open binary file such as `sys.stdin.buffer`.
@@ -84,7 +84,8 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
     Positions are written as float32, bit for bit where they are float32; PLY and OBJ hold float64 too where
     they are that. STL has no shared vertices. Attributes are written where the format can hold them, vertices
     split where it must be: `unkept` says what it cannot. GLB keeps instances, other formats are written
-    flattened. An OBJ file with materials gets a file of its name and .mtl beside it, where `target` is a path.
+    flattened. An OBJ file with materials gets a file of its name and .mtl beside it, where `target` is a
+    path.
 
     Args:
         mesh: What to write.

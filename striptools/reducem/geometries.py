@@ -12,12 +12,15 @@ import numpy as np
 from jaxtyping import UInt32
 
 from striptools.hierarchies.packed import Roots
-from striptools.mesh.instances import FARTHEST, Instances, determinant_signs, reach
+from striptools.mesh.instances import FARTHEST, Instances, Matrices, determinant_signs, reach
 from striptools.reducem import layout
 from striptools.reducem.issues import unreadable
-from striptools.types import Counts
+from striptools.types import Counts, Words
 
 __all__ = ["SceneGeometries", "SceneInstances", "check_geometries", "check_instance_rules", "roots_of"]
+
+
+GeometryRows = UInt32[np.ndarray, "g 4"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,7 @@ class SceneGeometries:
             how many source faces it has.
     """
 
-    rows: UInt32[np.ndarray, "g 4"]
+    rows: GeometryRows
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -56,9 +59,9 @@ class SceneInstances:
         matrix: (k, 3, 4) float64, see `mesh.instances.Instances`.
     """
 
-    geometry: UInt32[np.ndarray, " k"]
-    first_face: UInt32[np.ndarray, " k"]
-    matrix: np.ndarray
+    geometry: Words
+    first_face: Words
+    matrix: Matrices
 
     def __len__(self) -> int:
         return len(self.geometry)
@@ -165,7 +168,7 @@ def check_instance_rules(
     used = np.unique(instances.geometry)
     if len(used) == 0 or used[-1] >= len(geometries) or len(used) < len(geometries):
         raise unreadable("RDM551", place)
-    finite = np.isfinite(instances.matrix).all(axis=(1, 2))
+    finite = np.array(np.isfinite(instances.matrix).all(axis=(1, 2)))
     sound = finite.copy()
     sound[finite] = determinant_signs(instances.matrix[finite]) != 0
     if not sound.all():

@@ -107,7 +107,9 @@ _ALL = (
     _flaw("RDM528", "4.7", "a group has no material"),
     _flaw("RDM531", "4.8", "the materials are no JSON array of materials in UTF-8"),
     _flaw("RDM532", "4.8", "the materials are longer than 2^24 bytes"),
-    _flaw("RDM541", "4.10", "the blocks or top nodes of a geometry are none, too many, or out of their order"),
+    _flaw(
+        "RDM541", "4.10", "the blocks or top nodes of a geometry are none, too many, or out of their order"
+    ),
     _flaw("RDM542", "4.10", "the source faces of a geometry are too few, out of their order, or not there"),
     _flaw("RDM543", "4.10", "a triangle comes from a face of another geometry"),
     _flaw("RDM551", "4.11", "an instance has no geometry, or a geometry no instance"),

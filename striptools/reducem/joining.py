@@ -46,11 +46,13 @@ def join_geometries(built: Sequence[Built]) -> tuple[Sequences, Counts, NodeWord
     first = {name: np.cumsum([0, *numbers]) for name, numbers in counts.items()}
     roots = Roots(first["blocks"], first["tops"])
     if len(built) == 1:
-        return *built[0], roots
+        return built[0].sequences, built[0].starts, built[0].top, roots
     at = first["faces"][:-1].astype(np.int32)
     faces = np.concatenate([one.sequences.faces + k for one, k in zip(built, at, strict=True)])
     strips, starts = (
-        np.append(np.concatenate([one[:-1] + k for one, k in zip(rows, at, strict=True)]), np.int32(len(faces)))
+        np.append(
+            np.concatenate([one[:-1] + k for one, k in zip(rows, at, strict=True)]), np.int32(len(faces))
+        )
         for rows in ([one.sequences.starts for one in built], [one.starts for one in built])
     )
     return Sequences(faces, strips), starts, join_tops([one.top for one in built], roots), roots

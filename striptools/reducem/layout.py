@@ -238,7 +238,8 @@ PARTS = (
     "instances",
     "container",
 )
-"""What the bytes of a file are counted by; instances are geometries too; container is header, table, scene record, metadata and padding."""
+"""What the bytes of a file are counted by; instances are geometries too; container is header, table, scene
+record, metadata and padding."""
 
 
 def aligned(length: int) -> int:

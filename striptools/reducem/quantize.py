@@ -230,7 +230,7 @@ def recentred_bound(cleaned: Cleaned) -> float:
 
 
 def _exponent(mesh: Mesh, precision: PrecisionOptions, already: float) -> int:
-    """The grid that is asked for; finer by the largest stretch of instances, so that it holds where they stand."""
+    """The grid that is asked for, finer by the largest stretch of instances, to hold where they stand."""
     bounds, stretch = mesh.bounds, 1.0
     if mesh.geometries is not None and mesh.instances is not None:
         bounds = placed_bounds(mesh.positions, mesh.geometries, mesh.instances)

@@ -357,7 +357,7 @@ class _File:
         roots = roots_of(geometries, record["block_count"], record["top_count"])
         starts = scene.blocks.triangle_starts
         check_geometries(geometries, roots, starts, record["source_face_count"], self.where)
-        if layout.REMAP.kind in self.entries:
+        if scene.remap is not None:
             check_faces(geometries, roots, starts, scene.remap.face, self.where)
         return geometries
 

@@ -346,8 +346,8 @@ class Scene:
         Returns:
             Bytes of `positions`, `connectivity` (start, turn and flip bits, and indices),
             `in_block_hierarchy`, `block_headers`, `top_level`, `remap`, `attributes` (materials too),
-            `instances` (geometries too) and `container` (header, table, scene record, metadata, and what fills up words and sections); their
-            sum is the file's length.
+            `instances` (geometries too) and `container` (header, table, scene record, metadata, and what
+            fills up words and sections); their sum is the file's length.
         """
         from striptools.reducem.writer import part_sizes
 

@@ -101,7 +101,7 @@ def inspect_instances(inspection: Inspection) -> None:
 
 def _matrices(inspection: Inspection, section: Section, matrices: np.ndarray) -> None:
     """Look at the matrices: finite, with a determinant that is not zero, and within reach."""
-    flat = ~np.isfinite(matrices).all(axis=(1, 2))
+    flat = np.array(~np.isfinite(matrices).all(axis=(1, 2)))
     for i in np.flatnonzero(~flat):
         flat[i] = _is_flat(matrices[i].tolist())
     _found(inspection, "RDM552", flat, section, 104)

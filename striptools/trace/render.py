@@ -139,7 +139,12 @@ def _background(camera: Camera, options: RenderOptions) -> np.ndarray:
 
 
 def _surface_colours(
-    scene: Scene | Placed, camera: Camera, shading: Shading, directions: np.ndarray, hits: Hits, hit: np.ndarray
+    scene: Scene | Placed,
+    camera: Camera,
+    shading: Shading,
+    directions: np.ndarray,
+    hits: Hits,
+    hit: np.ndarray,
 ) -> np.ndarray:
     """(k, 3) linear colours of the rays that hit."""
     if shading == "depth":

@@ -62,9 +62,10 @@ class Scene:
             f32 are 32-bit patterns.
         materials: The array of MATL; empty where there is none.
         metadata: The object of META; empty where there is none.
-        geometries: For each `(first_block, first_top, first_face, face_count)`; one that has all where there is
-            no GEOM.
-        instances: For each `(geometry, first_face, matrix)`, the matrix twelve floats; None where there are none.
+        geometries: For each `(first_block, first_top, first_face, face_count)`; one that has all where there
+            is no GEOM.
+        instances: For each `(geometry, first_face, matrix)`, the matrix twelve floats; None where there are
+            none.
         passed_over: The kinds of sections that this reader does not know.
     """
 

@@ -435,7 +435,10 @@ def _instances() -> dict[str, tuple[str, Plan]]:
     )
     one = Plan([TRIANGLE], geometries=[(0, 0, 0, 1)], instances=[(0, 0, IDENTITY)])
     return {
-        "instances": ("two geometries in three instances, a mirror, a shear, source faces left out", _placed()),
+        "instances": (
+            "two geometries in three instances, a mirror, a shear, source faces left out",
+            _placed(),
+        ),
         "instances_stored": ("two trees over blocks and stored boxes", stored),
         "instances_of_blocks": ("geometries of one block, the least and the farthest matrix", singles),
         "instances_one": ("one geometry that stands where it is, no remap", one),
@@ -1038,7 +1041,9 @@ def _geometries() -> dict[str, tuple[str, list[str], bytes]]:
         "geometry_first_top": of("the first does not begin at node 0", "RDM541", (0, 1, 0, 4), second),
         "geometry_order": of("blocks out of their order", "RDM541", (0, 0, 0, 4), (0, 1, 5, 2)),
         "geometry_beyond": of("blocks behind the last", "RDM541", first, (3, 1, 5, 2)),
-        "geometry_tops": of("a geometry of two blocks without a node over them", "RDM541", first, (2, 0, 5, 2)),
+        "geometry_tops": of(
+            "a geometry of two blocks without a node over them", "RDM541", first, (2, 0, 5, 2)
+        ),
         "geometry_tops_many": of("more nodes over blocks than there are", "RDM541", first, (2, 2, 5, 2)),
         "geometry_faces_few": of("fewer source faces than triangles", "RDM542 RDM543", (0, 0, 0, 3), second),
         "geometry_faces_shared": of("source faces of two geometries", "RDM542 RDM554", (0, 0, 0, 6), second),
@@ -1051,10 +1056,10 @@ def _geometries() -> dict[str, tuple[str, list[str], bytes]]:
             "more geometries than blocks", "RDM114", _placed(), payloads={"GEOM": lambda d: d + bytes(32)}
         ),
         "geometry_empty": wrong("of an empty scene", "RDM117", Plan([]), payloads=empty),
-        "geometry_flag": wrong(
-            "need not be understood", "RDM116", _placed(), entries={"GEOM": {"flags": 0}}
+        "geometry_flag": wrong("need not be understood", "RDM116", _placed(), entries={"GEOM": {"flags": 0}}),
+        "geometry_child": wrong(
+            "a node of another geometry as a child", "RDM701 RDM703", twins, nodes=across
         ),
-        "geometry_child": wrong("a node of another geometry as a child", "RDM701 RDM703", twins, nodes=across),
         "geometry_block": wrong("a block of another geometry", "RDM703", twins),
     }
 
