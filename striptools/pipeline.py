@@ -20,6 +20,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.object_split import ObjectTree, split_objects
 from striptools.partition.sah import PartitionOptions
+from striptools.reducem.attributes import fitting
 from striptools.reducem.joining import Built, join_geometries, stored_instances, why_not_kept
 from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise, recentred_bound
 from striptools.reducem.reader import open_scene
@@ -229,7 +230,7 @@ def _loaded(source: Mesh | str | Path | IO[bytes], file_format: str | None, opti
     """The mesh, with instances where they are asked for and can be kept."""
     keep = options.instances
     mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
-    mesh = _geometry(mesh) if options.geometry_only else mesh
+    mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
     if keep and mesh.instances is not None:
         reason = why_not_kept(mesh)
         if reason is None:
@@ -281,13 +282,6 @@ def _quantised(
     given = (moved.cleaned.mesh, moved.cleaned.source_face, moved.error_bound, moved.cleaned.origin)
     largest = check_bound(mesh, *given)
     return moved.cleaned, moved.grid_exponent, moved.error_bound, largest
-
-
-def _geometry(mesh: Mesh) -> Mesh:
-    """The mesh without attributes, and a word about what was left out."""
-    words = [{"group": "groups and materials"}.get(one.name, f"{one.name}s") for one in mesh.attributes]
-    notes = (*mesh.notes, f"left out: {', '.join(words)}") if words else mesh.notes
-    return replace(mesh, notes=notes, attributes=(), materials=())
 
 
 def _metadata(source: Mesh | str | Path | IO[bytes], mesh: Mesh) -> dict[str, Any]:

@@ -1,5 +1,7 @@
+import base64
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import cube, grid, meshes, sphere
 
-from striptools.errors import UsageError
+from striptools.errors import StriptoolsError, UsageError
 from striptools.mesh.attributes import (
     Attribute,
     Material,
@@ -518,3 +520,42 @@ def test_what_a_format_cannot_hold_is_said():
     assert unkept(Mesh(np.eye(3) * 0.1, np.array([[0, 1, 2]])), "stl") == (
         "what float32 cannot hold of the positions",
     )
+
+
+# ------------------------------------------------------------------------------------- damage
+
+
+def attributed(file_format):
+    """A small file of a format with every attribute that it can hold."""
+    if file_format == "gltf":
+        tree, data = glb_tree()
+        uri = "data:;base64," + base64.b64encode(data).decode()
+        return json.dumps(tree | {"buffers": [{"byteLength": len(data), "uri": uri}]}).encode()
+    if file_format == "off":
+        rows = "".join(f"{x} {y} 0 0 0 1 {x} 0 0 255 .5 .25\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+        return f"STCNOFF\n3 1 0\n{rows}3 0 1 2 1 2 3\n".encode()
+    mesh = with_attributes(Mesh(*cube()), 5, domains={"color": "vertex", "texcoord": "corner"})
+    stream = io.BytesIO()
+    save_mesh(mesh, stream, file_format=file_format)
+    return stream.getvalue()
+
+
+KINDS = {name: attributed(name) for name in ("ply", "obj", "glb", "gltf", "off")} | {"ascii": PLY.encode()}
+
+
+@given(st.sampled_from(sorted(KINDS)), st.data())
+def test_damage_ends_in_a_mesh_or_an_error_line(kind, data):
+    damaged = bytearray(KINDS[kind])
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    if data.draw(st.booleans()):
+        del damaged[data.draw(st.integers(0, len(damaged) - 1)) :]
+    try:
+        mesh = read(bytes(damaged), {"ascii": "ply"}.get(kind, kind))
+    except StriptoolsError as refusal:
+        error = str(refusal)
+    else:
+        assert clean(mesh).counts["faces_in"] > 0
+        return
+    assert "\n" not in error
+    assert not re.search(r"malformed: \w+(Error|Exception) ", error), "an exception that no reader foresaw"

@@ -10,6 +10,7 @@ import tracemalloc
 import zlib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,8 +20,10 @@ from strategies import grid
 import striptools
 from formats import mended
 from striptools.errors import MissingExtraError, UnreadableSceneError, WriteError
+from striptools.mesh.attributes import Material
 from striptools.mesh.mesh import Mesh
 from striptools.reducem import layout
+from striptools.reducem.attributes import Column
 from striptools.reducem.issues import ISSUES
 from striptools.reducem.reader import PIECE, open_scene, read_scene
 from striptools.reducem.validate import validate
@@ -34,8 +37,15 @@ def bytes_of(scene, **options):
 
 def full_scene():
     """A scene with every kind of section, of several blocks."""
+    scene = small_scene(flips=True, block=6, boxes="stored")
+    colours = np.arange(6, dtype=np.uint8).reshape(2, 3), np.arange(scene.vertex_count, dtype=np.int32) % 2
+    groups = np.int32([[1], [0]]), np.minimum(np.arange(scene.triangle_count, dtype=np.int32), 1)
     return replace(
-        small_scene(flips=True, block=6, boxes="stored"), metadata={"generator": "a test", "source": "s"}
+        scene,
+        metadata={"generator": "a test", "source": "s"},
+        columns=(Column("color", "vertex", *colours), Column("group", "face", *groups)),
+        materials=(Material("red"), Material("", (0.0, 0.5, 1.0, 0.25), "body")),
+        origin=np.array([1e6, 0.0, -2e6]),
     )
 
 
@@ -61,6 +71,8 @@ def arrays(scene):
     return (
         *(scene.blocks.headers, scene.blocks.words, packed.nodes, *stored, *remap),
         *(scene.positions, scene.vertices, scene.turns, scene.starts, scene.faces(), scene.low, scene.high),
+        *(array for one in scene.columns for array in (one.rows, one.numbers)),
+        *(() if scene.origin is None else (scene.origin,)),
     )
 
 
@@ -69,7 +81,15 @@ def assert_same(one, other):
         assert a.dtype == b.dtype
         assert a.shape == b.shape
         assert a.tobytes() == b.tobytes()
-    for name in ("error_bound", "source_face_count", "grid_exponent", "metadata", "boxes", "block_count"):
+    for name in (
+        "error_bound",
+        "source_face_count",
+        "grid_exponent",
+        "metadata",
+        "materials",
+        "boxes",
+        "block_count",
+    ):
         assert getattr(one, name) == getattr(other, name)
     assert one.packed.top_count == other.packed.top_count
     assert one.packed.longest_run == other.packed.longest_run
@@ -217,7 +237,7 @@ def test_an_archive_expands_to_the_file_written_without_it(tmp_path):
     assert len(packed) < len(raw)
     rows = table_of(packed)
     assert rows[0][:3] == [b"SCEN", 1, 0]
-    assert {row[2] for row in rows} == {0, 1}
+    assert {row[2] for row in rows} == {0, 1, 2, 3}
     assert all(row[4] < row[5] for row in rows if row[2])
     assert validate(packed) == []
     assert bytes_of(read_scene(packed)) == raw

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from attributes import MATERIALS, at_faces, attributed_meshes, with_attributes, words
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from strategies import cube, grid, sphere
 
@@ -29,6 +29,7 @@ from striptools.reducem.attributes import (
 )
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.reader import read_scene
+from striptools.reducem.validate import validate
 
 
 def saved(scene, **how):
@@ -56,6 +57,7 @@ def test_every_corner_survives_the_file_bit_for_bit(mesh, bits, drop_duplicates)
         scene = again(convert(mesh, options))
     except UnreadableMeshError:
         return
+    assert validate(saved(scene)) == []
     back = scene.to_mesh()
     assert_same_corners(back, mesh, np.sort(scene.remap.face))
     assert back.unit == "mm"
@@ -67,6 +69,7 @@ def test_every_corner_survives_the_file_bit_for_bit(mesh, bits, drop_duplicates)
 
 @given(attributed_meshes(hostile=False), st.integers(0, 2**32))
 def test_a_scene_gives_the_values_of_its_own_triangles(mesh, seed):
+    assume(clean(mesh).mesh.triangle_count)
     scene = convert(mesh, Options(threads=1))
     assert saved(scene) == saved(convert(mesh, Options(threads=2)))
     back = (np.arange(3) - scene.remap.rotation[:, None]) % 3
@@ -210,6 +213,30 @@ def test_a_survey_comes_back_about_its_origin(bits):
     assert np.linalg.norm(away, axis=2).max() <= opened.error_bound
     if bits is None:
         assert opened.error_bound < 1e-4
+
+
+def test_a_tracer_says_in_which_frame_it_works():
+    from striptools.trace import Tracer
+
+    mesh = survey()
+    scene = again(convert(mesh))
+    tracer = Tracer(scene)
+    np.testing.assert_array_equal(tracer.origin, scene.origin)
+    corners = mesh.positions[mesh.faces[17]]
+    above = corners.mean(axis=0) + np.array([0.0, 0.0, 64.0])
+    hits = tracer.closest_hit((above - tracer.origin)[None], np.array([[0.0, 0.0, -1.0]]))
+    assert hits.face.tolist() == [17]
+    assert hits.t[0] == pytest.approx(64.0, abs=1e-3)
+    np.testing.assert_array_equal(Tracer(convert(Mesh(*cube()))).origin, np.zeros(3))
+
+
+def test_a_recentred_scene_is_verified_against_its_source():
+    from striptools.measure.verify import VerifyOptions, verify
+
+    mesh = survey()
+    report = verify(again(convert(mesh)), mesh, VerifyOptions(rays=64, aimed_rays=512))
+    assert report.ok
+    assert report.aimed_certain > 0
 
 
 def test_an_origin_may_be_forbidden():
@@ -389,12 +416,21 @@ def test_malformed_materials_are_refused(text):
 def test_materials_beyond_the_limit_are_refused():
     scene = coloured(names=("group",))
     with pytest.raises(UnreadableSceneError, match="RDM532"):
-        read_scene(put(scene, b"MATL", b" " * (2**24 + 1)))
+        read_scene(put(scene, b"MATL", b" " * (2**22 + 1)))
     with pytest.raises(LimitError, match="are too many"):
-        encode_materials((Material("x" * 400),) * 50_000)
+        encode_materials((Material("x" * 100),) * 50_000)
     assert json.loads(encode_materials(MATERIALS))[0] == {
         "name": "red", "base_color": [1.0, 0.0, 0.0, 1.0], "group": "body",
     }  # fmt: skip
+
+
+def test_more_groups_than_a_scene_holds_are_left_out_with_a_word():
+    positions, faces = cube()
+    groups = Attribute("group", "face", np.arange(12, dtype=np.int32)[:, None])
+    materials = tuple(Material(f"{k}" * 100) for k in range(12)) + (Material("x" * 110),) * 40_000
+    scene, report = convert_with_report(Mesh(positions, faces, (), (groups,), materials))
+    assert scene.attributes == ()
+    assert report.notes == ("groups left out: 40012 materials are too many",)
 
 
 def test_a_broken_attribute_leaves_the_geometry_readable():
@@ -421,3 +457,48 @@ def test_numbers_of_every_width_come_back(count, rows, seed):
     np.testing.assert_array_equal(back.numbers, numbers)
     np.testing.assert_array_equal(back.rows, table)
     assert len(raw) == 8 + 16 + column.byte_count
+
+
+# ------------------------------------------------------------------------------------- the command line
+
+
+def run(capsys, *arguments):
+    """The exit code of a command, and what it wrote."""
+    from striptools_cli.app import main
+
+    code = main([str(argument) for argument in arguments])
+    written = capsys.readouterr()
+    assert code == 0, written.err
+    return written.out + written.err
+
+
+def test_the_command_line_keeps_attributes_or_says_what_it_leaves_out(tmp_path, capsys):
+    mesh = with_attributes(Mesh(*sphere(1)), 3, domains={"color": "vertex"})
+    save_mesh(mesh, tmp_path / "a.ply")
+    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "a.rdm", "-v")
+    assert "  attributes " in said
+    facts = json.loads(run(capsys, "info", tmp_path / "a.rdm", "--format", "json"))
+    assert set(facts["attributes"]) == {"normal", "texcoord", "color"}
+    assert facts["bytes"]["attributes"] > sum(one["bytes"] for one in facts["attributes"].values())
+    assert "left out" not in run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "b.ply")
+    said = run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "b.stl")
+    assert "left out: normals, texcoords, colors" in said
+    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "g.rdm", "--geometry-only")
+    assert "left out: normals, texcoords, colors" in said
+    facts = json.loads(run(capsys, "info", tmp_path / "g.rdm", "--format", "json"))
+    assert "attributes" not in facts
+    said = run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "s.glb", "--strips")
+    assert "left out: normals, texcoords, colors" in said
+
+
+def test_the_command_line_says_where_an_origin_is(tmp_path, capsys):
+    save_mesh(survey(), tmp_path / "a.ply")
+    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "a.rdm")
+    assert "moved to an origin at (450560, 5400576, 300.5), in whose frame rays are traced" in said
+    facts = json.loads(run(capsys, "info", tmp_path / "a.rdm", "--format", "json"))
+    assert facts["origin"] == [450560, 5400576, 300.5]
+    assert facts["precision"]["kind"] == "recentred"
+    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "b.rdm", "--recentre", "never")
+    assert "origin" not in said
+    run(capsys, "convert", tmp_path / "a.ply", tmp_path / "s.ply", "--strips")
+    np.testing.assert_allclose(load_mesh(tmp_path / "s.ply").bounds, survey().bounds, atol=1.0)

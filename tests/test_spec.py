@@ -96,10 +96,19 @@ def test_the_sections_are_the_specifications_table():
 
 
 def test_the_codecs_are_the_specifications_table():
-    (rows,) = tables(SPEC, "codec | name | stored bytes")
-    codecs = [(int(row[0]), row[1]) for row in rows]
-    assert codecs == [(layout.CODEC_RAW, "raw"), (layout.CODEC_ZSTD, "zstd")]
-    assert f"2^{layout.LARGEST_WINDOW} bytes" in rows[1][2]
+    (rows,) = tables(SPEC, "codec | name | for | what the frame holds")
+    assert [(int(row[0]), row[1]) for row in rows] == [
+        (layout.CODEC_RAW, "raw"),
+        (layout.CODEC_ZSTD, "zstd"),
+        (layout.CODEC_BLOCKS, "blocks"),
+        (layout.CODEC_PLANES, "planes"),
+    ]
+    for codec, _, kinds, _ in rows[2:]:
+        having = [s.kind.decode() for s in layout.SECTIONS if int(codec) in layout.codecs_of(s)]
+        assert kinds.split(", ") == having
+    widths = [f"{width} in {kind.decode()}" for kind, width in layout.PLANE_WIDTHS.items()]
+    assert f"bytes of a record, {', '.join(widths[:3])} and {widths[3]}" in SPEC.replace("\n", " ")
+    assert f"2^{layout.LARGEST_WINDOW} bytes" in SPEC
 
 
 def test_the_limits_are_the_specifications():

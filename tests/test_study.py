@@ -61,7 +61,7 @@ def test_every_row_is_measured(study: Study) -> None:
         assert row.primary_steps >= 1
         assert row.secondary_steps >= 1
         assert row.order_seconds >= 0
-        assert row.swap_bytes == row.scene_bytes - 512 // 8 + 4 * row.quality.swaps
+        assert row.swap_bytes == row.scene_bytes - 512 // 8 + row.quality.swaps
         assert row.quality.longest <= (row.max_length or 512)
         assert row.quality.full_cost == first.quality.full_cost
 

@@ -311,6 +311,7 @@ def _to_scene(
         "weld_error": report.weld_error,
         "error_bound": scene.error_bound,
         "largest_error": report.largest_error,
+        "origin": None if report.origin is None else report.origin.tolist(),
         "notes": list(report.notes),
     }
     return _Outcome(lines, list(_details(seconds, scene)), facts)
@@ -380,9 +381,11 @@ def _loaded_clean(
 ) -> tuple[Mesh, list[str], dict[str, int]]:
     """A mesh fit for strips, what loading and cleaning have to say, and cleaning's counts."""
     if read_format == SCENE_FORMAT:
-        return read_scene(source.file).flattened(), [], {}
-    mesh = load_mesh(source.file, file_format=read_format or None)
-    cleaned = clean(mesh, options.clean)
+        mesh = read_scene(source.file).flattened().geometry()
+        return mesh, [f"  {note}" for note in mesh.notes], {}
+    mesh = load_mesh(source.file, file_format=read_format or None).geometry()
+    # A mesh has no place for an origin.
+    cleaned = clean(mesh, dataclasses.replace(options.clean, recentre="never"), options.threads or 1)
     if cleaned.mesh.triangle_count == 0:
         raise UnreadableMeshError("no face is left after cleaning", where=source.title)
     report = Report(

@@ -1,13 +1,14 @@
 """Half-edge rings by two counting sorts: linear whatever the mesh, fans of 100,000 faces included."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel, maker
 
 LONGEST_RING = 4
 """Half-edges on a ring; the last ring of an edge may have one more, so that none is left alone."""
 
 
-@njit(cache=True, nogil=True)
+@maker
 def sort_half_edges(faces, vertex_count, order, scratch):
     """Fill `order` with the half-edges sorted by (smaller vertex, larger vertex, half-edge)."""
     half_edges = 3 * faces.shape[0]
@@ -44,7 +45,7 @@ def sort_half_edges(faces, vertex_count, order, scratch):
         place[low] += 1
 
 
-@njit(cache=True, nogil=True)
+@helper
 def interleave_windings(faces, order, begin, end, row):
     """Write the half-edges `order[begin:end]` of one edge to `row`, forward and backward in turn."""
     forward = begin
@@ -70,7 +71,7 @@ def interleave_windings(faces, order, begin, end, row):
                 break
 
 
-@njit(cache=True, nogil=True)
+@helper
 def close_rings(row, count, ring):
     """Cut `row[:count]` into rings of at most `LONGEST_RING` (the last takes in a lone rest), closed."""
     begin = 0
@@ -84,7 +85,7 @@ def close_rings(row, count, ring):
         begin = end
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ring_half_edges(faces, vertex_count):
     """Next half-edge of the same undirected edge for each half-edge, `(3n,)` int32; itself on a border."""
     half_edges = 3 * faces.shape[0]

@@ -12,14 +12,15 @@ The loops behind strips/alternating.py.
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel, maker
 
 Lines = namedtuple("Lines", "leave begin end following head")
 """leave (3n,) the half-edge each face of all lines is left by, line after line; begin and end of each piece
 of a line in there; the next piece of the same length; head (longest + 1,) the first piece of each length."""
 
 
-@njit(cache=True, nogil=True)
+@helper
 def other_link(mate, h):
     """The linked half-edge of the face of h that is not h; -1 where there is none."""
     base = h - h % 3
@@ -29,7 +30,7 @@ def other_link(mate, h):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@helper
 def repeats_across(h, g, mate):
     """1 where the faces of the linked half-edges h and g are both passed by the same turn, else 0."""
     p = other_link(mate, h)
@@ -41,20 +42,20 @@ def repeats_across(h, g, mate):
     return 1 if (h - p + 3) % 3 == (q - g + 3) % 3 else 0
 
 
-@njit(cache=True, nogil=True)
+@helper
 def repeats_at(h, mate):
     """repeats_across the link of half-edge h; 0 for h = -1."""
     return repeats_across(h, mate[h], mate) if h >= 0 else 0
 
 
-@njit(cache=True, nogil=True)
+@helper
 def repeats_near(h, g, mate):
     """Repeated turns across the link of h and g and the links before and after it."""
     here = repeats_across(h, g, mate)
     return here + repeats_at(other_link(mate, h), mate) + repeats_at(other_link(mate, g), mate)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def onward(ring, forward, h, turn):
     """How a line that leaves a face across h by `turn` leaves the next face: a half-edge, -1 at its end.
 
@@ -67,7 +68,7 @@ def onward(ring, forward, h, turn):
     return g - slot + (slot + (2 if turn == 0 else 1)) % 3
 
 
-@njit(cache=True, nogil=True)
+@helper
 def first_of_line(ring, forward, state):
     """The first face of the line through the face state // 3 past its slot state % 3: how it is left."""
     # Walk against the line to its end, or once round.
@@ -87,7 +88,7 @@ def first_of_line(ring, forward, state):
     return h - slot + (slot + (2 if turn == 0 else 1)) % 3, 1 - turn
 
 
-@njit(cache=True, nogil=True)
+@maker
 def find_lines(ring, forward, least, lines):
     """List the lines of at least `least` faces; returns how many. Every face lies on three lines."""
     seen = np.zeros(ring.shape[0], np.bool_)
@@ -118,7 +119,7 @@ def find_lines(ring, forward, least, lines):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def put_piece(lines, piece, begin, end):
     """Keep a piece with the others of its length."""
     lines.begin[piece] = begin
@@ -127,7 +128,7 @@ def put_piece(lines, piece, begin, end):
     lines.head[end - begin] = piece
 
 
-@njit(cache=True, nogil=True)
+@helper
 def split_piece(lines, piece, pieces, least, taken, stamp, scan):
     """Put back what is free of a piece, run by run; returns whether all of it is, pieces and scans so far.
 
@@ -159,7 +160,7 @@ def split_piece(lines, piece, pieces, least, taken, stamp, scan):
     return False, pieces, scan + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_longest_lines(ring, forward, least, mate, links):
     """Link the faces of the longest line, then of the longest of what is left, down to `least` faces."""
     half_edges = ring.shape[0]
@@ -201,7 +202,7 @@ def take_longest_lines(ring, forward, least, mate, links):
                 links[g // 3] += 1
 
 
-@njit(cache=True, nogil=True)
+@helper
 def strip_of(owner, t):
     """The face that stands for the strip of t, paths halved on the way."""
     while owner[t] != t:
@@ -210,13 +211,13 @@ def strip_of(owner, t):
     return t
 
 
-@njit(cache=True, nogil=True)
+@helper
 def may_link(h, g, forward, mate, links):
     """Whether h and g are free and opposite, and the face of g has a free end."""
     return mate[g] < 0 and forward[g] != forward[h] and links[g // 3] < 2
 
 
-@njit(cache=True, nogil=True)
+@helper
 def open_links(t, ring, forward, mate, links):
     """How many links face t could still take."""
     count = 0
@@ -228,7 +229,7 @@ def open_links(t, ring, forward, mate, links):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def cheapest_link(t, most, ring, forward, mate, links, owner):
     """The link of face t that adds fewest repeated turns, at most `most`; then to the least linkable face."""
     best = (most + 1) << 8
@@ -253,7 +254,7 @@ def cheapest_link(t, most, ring, forward, mate, links, owner):
     return best_h, best_g
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def link_faces(most, ring, forward, mate, links, owner):
     """Grow strips from each face in turn by links that add at most `most` repeated turns; how many were made.
 
@@ -277,7 +278,7 @@ def link_faces(most, ring, forward, mate, links, owner):
     return made
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def name_strips(mate, owner):
     """Let each face lead to the least face that it is linked with, directly or not."""
     for t in range(owner.shape[0]):
@@ -289,7 +290,7 @@ def name_strips(mate, owner):
             owner[max(a, b)] = min(a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def price_of(mate, strip_price):
     """Indices above one a triangle: strip_price a strip and one for each repeated turn."""
     linked = 0

@@ -19,9 +19,9 @@ The loops behind strips/alternating.py; half-edges, mate and forward are those o
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
 from striptools.kernels.alternating_lines import other_link, repeats_across, repeats_at, repeats_near
+from striptools.kernels.compiled import helper, kernel, maker
 
 Cover = namedtuple("Cover", "ring forward mate owner pos first last misfit part stale")
 """ring, forward, mate (3n,); owner (n,) the strip of a face and pos (n,) its place in it; first and last
@@ -47,7 +47,7 @@ ANY_PART = -1
 STALE, MET = 1, 2
 
 
-@njit(cache=True, nogil=True)
+@maker
 def new_desk(deepest):
     """Scratch for chains of up to `deepest` rotations."""
     return Desk(
@@ -59,7 +59,7 @@ def new_desk(deepest):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def begins_badly(face, mate):
     """Whether a strip written from its end `face` on repeats an index for its first turn, which is 0 then."""
     for h in range(3 * face, 3 * face + 3):
@@ -70,7 +70,7 @@ def begins_badly(face, mate):
     return False
 
 
-@njit(cache=True, nogil=True)
+@helper
 def number_strip(face, strip, cover):
     """Number the faces of a strip from its end `face` on."""
     mate = cover.mate
@@ -94,7 +94,7 @@ def number_strip(face, strip, cover):
     cover.misfit[strip] = begins_badly(begin, mate) and begins_badly(face, mate)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def links_of(face, mate):
     """The two last linked half-edges of a face, -1 for those that are not."""
     one = -1
@@ -106,7 +106,7 @@ def links_of(face, mate):
     return one, two
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number_strips(cover):
     """Number every strip, in the order of its least end; returns how many."""
     cover.owner[:] = -1
@@ -118,7 +118,7 @@ def number_strips(cover):
     return strips
 
 
-@njit(cache=True, nogil=True)
+@helper
 def piece_of(face, depth, cover, desk):
     """The row of the table at `depth` that holds a face; its whole strip is added where it is new."""
     strip = cover.owner[face]
@@ -140,7 +140,7 @@ def piece_of(face, depth, cover, desk):
     return k
 
 
-@njit(cache=True, nogil=True)
+@helper
 def copy_cut(depth, one, other, u, w, cover, desk):
     """Copy the table one depth down; where rows `one` and `other` are one, cut it between faces u and w."""
     pieces = desk.pieces
@@ -160,7 +160,7 @@ def copy_cut(depth, one, other, u, w, cover, desk):
     desk.used[depth + 1] = used
 
 
-@njit(cache=True, nogil=True)
+@helper
 def rotate_pieces(depth, u, w, cover, desk):
     """Make the table one depth down, of the end's rotation to u that cuts u from w; whether it may be done.
 
@@ -202,7 +202,7 @@ def rotate_pieces(depth, u, w, cover, desk):
     return True
 
 
-@njit(cache=True, nogil=True)
+@helper
 def next_neighbour(frame, mine, strip, cover):
     """Move the frame's cursor to the next half-edge that its end could link to; whether there is one."""
     ring = cover.ring
@@ -225,7 +225,7 @@ def next_neighbour(frame, mine, strip, cover):
     return False
 
 
-@njit(cache=True, nogil=True)
+@helper
 def keep_best(rotations, linked, h, g, desk):
     """Write down the chain at hand as the best one."""
     desk.best[0, 0] = rotations
@@ -237,7 +237,7 @@ def keep_best(rotations, linked, h, g, desk):
             desk.best[k + 1, column] = desk.steps[k, column]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def ends_of(name, depth, desk):
     """The two end faces of the strip of a label."""
     pieces = desk.pieces
@@ -260,7 +260,7 @@ def ends_of(name, depth, desk):
     return low_face, high_face
 
 
-@njit(cache=True, nogil=True)
+@helper
 def misfits_before(depth, cover, desk):
     """Misfits among the strips in the table, as they were before the chain."""
     count = 0
@@ -270,7 +270,7 @@ def misfits_before(depth, cover, desk):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def misfits_after(depth, linked_to, t, u, cover, desk):
     """Misfits among the strips in the table, those of t and of `linked_to`, whose end is u, being one."""
     mate = cover.mate
@@ -292,7 +292,7 @@ def misfits_after(depth, linked_to, t, u, cover, desk):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def price_of_link(depth, h, g, strip_price, best, cover, desk):
     """The chain's price where it ends by linking h and g; `best` where it is no less or closes a ring."""
     frame = desk.frames[depth]
@@ -310,7 +310,7 @@ def price_of_link(depth, h, g, strip_price, best, cover, desk):
     return price
 
 
-@njit(cache=True, nogil=True)
+@helper
 def price_of_stop(depth, best, cover, desk):
     """The chain's price where it ends without a link; `best` or more where it is no less."""
     price = desk.frames[depth, PRICE] - misfits_before(depth, cover, desk)
@@ -319,7 +319,7 @@ def price_of_stop(depth, best, cover, desk):
     return price
 
 
-@njit(cache=True, nogil=True)
+@helper
 def rotate(depth, h, g, cut, cover, desk):
     """Do a rotation and open the frame below; returns whether it may be done."""
     mate = cover.mate
@@ -355,7 +355,7 @@ def rotate(depth, h, g, cut, cover, desk):
     return True
 
 
-@njit(cache=True, nogil=True)
+@helper
 def undo_rotation(depth, cover, desk):
     """Put the links back as they were before the rotation at `depth`."""
     mate = cover.mate
@@ -365,7 +365,7 @@ def undo_rotation(depth, cover, desk):
     mate[desk.steps[depth, 3]] = desk.steps[depth, 2]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def find_chain(rotations, strip_price, must_link, mine, cover, desk):
     """Try all chains of exactly so many rotations from the frame at depth 0; the best price, 0 if none pays.
 
@@ -408,7 +408,7 @@ def find_chain(rotations, strip_price, must_link, mine, cover, desk):
     return best
 
 
-@njit(cache=True, nogil=True)
+@helper
 def start_at_end(t, cover, desk):
     """Set depth 0 to an end face and its strip."""
     strip = cover.owner[t]
@@ -425,7 +425,7 @@ def start_at_end(t, cover, desk):
     frame[SIDE] = 0
 
 
-@njit(cache=True, nogil=True)
+@helper
 def start_at_cut(h, g, strip_price, cover, desk):
     """Cut the link of h and g and set depth 0 to the face of h, an end now."""
     t = h // 3
@@ -447,7 +447,7 @@ def start_at_cut(h, g, strip_price, cover, desk):
     desk.frames[0, PRICE] = price
 
 
-@njit(cache=True, nogil=True)
+@helper
 def changed_faces(t, cover, desk, faces):
     """List the faces whose links the best chain changes, begun at t; returns how many."""
     count = 1
@@ -463,7 +463,7 @@ def changed_faces(t, cover, desk, faces):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def carry_out(t, cut_from, cover, desk, faces, strips):
     """Do the best chain found from t and number the strips it touches anew; marks stale what it may help."""
     mate = cover.mate
@@ -521,7 +521,7 @@ def carry_out(t, cut_from, cover, desk, faces, strips):
                 g = cover.ring[g]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def search_strip(strip, deepest, strip_price, must_link, mine, cover, desk, faces, strips):
     """Carry out the first chain that pays from either end of a strip, of fewest rotations; what it saves."""
     saved = 0
@@ -539,7 +539,7 @@ def search_strip(strip, deepest, strip_price, must_link, mine, cover, desk, face
     return saved
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_strips(ids, passes, deepest, strip_price, mine, cover):
     """Search from the ends of the stale strips among `ids`, shortest first, pass after pass; what it saves.
 
@@ -570,7 +570,7 @@ def search_strips(ids, passes, deepest, strip_price, mine, cover):
     return saved
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_cuts(deepest, strip_price, must_link, mine, cover):
     """Search from every link between equal turns as if it were cut; a chain must make up for the cut."""
     desk = new_desk(deepest)

@@ -7,7 +7,8 @@ that no number is rounded on the way in; on the way out an integer times a power
 from math import ldexp
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import inlined, kernel
 
 SOUND = 0
 WRONG_FIRST = 1
@@ -42,7 +43,7 @@ HIGHEST = 106
 NEGATIVE_ZERO = 1 << 31
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def put(words, bit, value, width):
     """Write the `width` bits (0 to 32) of a number at a bit of zeroed words; returns the bit behind them."""
     place = bit >> 5
@@ -54,7 +55,7 @@ def put(words, bit, value, width):
     return bit + width
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def take(words, bit, width):
     """The number in `width` bits (0 to 32) from a bit on; reads one word more than it has to."""
     place = bit >> 5
@@ -62,7 +63,7 @@ def take(words, bit, width):
     return wide >> (bit & 31) & ((1 << width) - 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bit_width(number):
     """The least w with number < 2**w."""
     width = 0
@@ -71,13 +72,13 @@ def bit_width(number):
     return width
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def ordered(word):
     """The integer that stands for the bits of a float32 in mode 2: it rises with the number."""
     return word if word < NEGATIVE_ZERO else NEGATIVE_ZERO - 1 - word
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def split_bits(word):
     """The bits of a finite float32 as (size, exponent): the number is size * 2**exponent, its sign apart."""
     field = word >> 23 & 0xFF
@@ -87,7 +88,7 @@ def split_bits(word):
     return size, LOWEST
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def multiple_of(word, exponent):
     """The bits of a float32 as a multiple of 2**exponent, which it is; needs room for it in an int64."""
     size, own = split_bits(word)
@@ -95,7 +96,7 @@ def multiple_of(word, exponent):
     return -size if word & NEGATIVE_ZERO else size
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def finest_bit(word, finest):
     """The exponent of the finest set bit of a float32, or `finest` where that is less; 0 has none."""
     size, own = split_bits(word)
@@ -108,7 +109,7 @@ def finest_bit(word, finest):
     return own
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number_vertices(vertices, begin, end, table, local, used):
     """Number the vertices[begin:end] of a block by first use.
 
@@ -143,7 +144,7 @@ def number_vertices(vertices, begin, end, table, local, used):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose_axis(bits, used, count, axis):
     """The narrowest way to write a block's coordinates on an axis: (mode, width, anchor, exponent).
 
@@ -190,7 +191,7 @@ def choose_axis(bits, used, count, axis):
     return mode, width, anchor, exponent
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def put_vertices(bits, used, count, modes, anchors, exponents, widths, words, bit):
     """Write a block's vertices from a bit on; returns the bit behind them."""
     for k in range(count):
@@ -206,7 +207,7 @@ def put_vertices(bits, used, count, modes, anchors, exponents, widths, words, bi
     return bit
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def encode(bits, vertices, turns, flips, starts, block_strips, first, last, headers, words):
     """Write the blocks first:last from word 0 of `words` on.
 
@@ -290,7 +291,7 @@ def encode(bits, vertices, turns, flips, starts, block_strips, first, last, head
     return word
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def block_counts(headers, block):
     """Triangles, vertices and strips of a block, whether it has flip bits, and the width of its indices."""
     packed = np.int64(headers[block, 2])
@@ -300,7 +301,7 @@ def block_counts(headers, block):
     return count, vertex_count, strips, packed >> 24 & 1, bit_width(vertex_count - 1)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def axis_of(headers, block, axis):
     """Mode, width, anchor and exponent of a block's axis."""
     packed = np.int64(headers[block, 6]) | np.int64(headers[block, 7]) << 32
@@ -311,7 +312,7 @@ def axis_of(headers, block, axis):
     return described >> 6, described & 63, anchor, (packed >> 24 + 8 * axis & 0xFF) + LOWEST
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_bits(headers, block):
     """The bits of a block's data: start, turn and flip bits, indices, vertices."""
     count, vertex_count, strips, has_flips, index_width = block_counts(headers, block)
@@ -322,7 +323,7 @@ def block_bits(headers, block):
     return connectivity, vertex_count * width
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_parts(headers):
     """Of all blocks: vertices, strips, bits of connectivity, bits of vertices, words."""
     vertices = strips = connectivity = positions = words = 0
@@ -337,7 +338,7 @@ def sum_parts(headers):
     return vertices, strips, connectivity, positions, words
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def header_flaw(headers, words, triangle_count):
     """The first rule of 4.2 that headers break, and the block: all that safe decoding rests on."""
     word = triangle = 0
@@ -372,7 +373,7 @@ def header_flaw(headers, words, triangle_count):
     return SOUND, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_strips(headers, words, block, base, strip, vertices, turns, flips, starts):
     """Decode the strips of a block; arguments as in `decode`.
 
@@ -454,7 +455,7 @@ def take_strips(headers, words, block, base, strip, vertices, turns, flips, star
     return SOUND if largest == vertex_count - 1 else NOT_USED
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_axis(headers, words, block, axis, base, bit, stride, positions, bits):
     """Decode the coordinates of a block on one axis; returns the rule that they break, or SOUND."""
     count = block_counts(headers, block)[1]
@@ -484,7 +485,7 @@ def take_axis(headers, words, block, axis, base, bit, stride, positions, bits):
     return SOUND
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode(
     headers, words, vertex_starts, strip_starts, first, last, positions, bits, vertices, turns, flips, starts
 ):
@@ -528,7 +529,7 @@ def decode(
     return SOUND, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fan_starts(turns, starts, is_first):
     """Mark where strips must be cut so that no more than MOST_EQUAL turn bits in a row are equal.
 

@@ -11,7 +11,8 @@ ones. The loops behind strips/topology.py.
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel
 
 Ends = namedtuple("Ends", "vertex turn repeats length")
 """vertex (s, 2) where each way of writing a strip begins, turn (s, 2) uint8 the first turn of each way, 2
@@ -26,7 +27,7 @@ MOST_LOOKED_AT = 16
 """So many strips that meet at a vertex are looked at before a strip is begun elsewhere."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def describe(faces, turns, starts):
     """The ends of each strip: faces (n, 3) its decoded triangles, turns and starts as in Strips."""
     strips = starts.shape[0] - 1
@@ -52,14 +53,14 @@ def describe(faces, turns, starts):
     return ends
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def misfit(ends, s, way, place):
     """1 where a strip written so from this place on repeats an index for its first turn."""
     turn = ends.turn[s, way]
     return 1 if turn != NO_TURN and turn == place % 2 else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def meet(faces, starts, ends, vertex_count):
     """Strips by the vertices they may begin with: (vertices + 1,) first places and (m,) codes.
 
@@ -86,7 +87,7 @@ def meet(faces, starts, ends, vertex_count):
     return first, codes
 
 
-@njit(cache=True, nogil=True)
+@helper
 def next_at(vertex, place, first, reached, codes, ends, used):
     """The code of an unused strip that begins with a vertex and fits the place; -1 where there is none.
 
@@ -112,7 +113,7 @@ def next_at(vertex, place, first, reached, codes, ends, used):
     return found
 
 
-@njit(cache=True, nogil=True)
+@helper
 def last_vertex(faces, starts, ends, s, way, corner, place):
     """The vertex that a strip written so from this place on ends with."""
     if ends.length[s] == 1:
@@ -120,7 +121,7 @@ def last_vertex(faces, starts, ends, s, way, corner, place):
     return ends.vertex[s, 1 - way]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def begin_at(start, place, ends, used):
     """The first of a few unused strips from `start` on that fits the place from one end, as a code.
 
@@ -133,7 +134,7 @@ def begin_at(start, place, ends, used):
     return 4 * start
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plan(faces, starts, ends, vertex_count, apart, keep_places):
     """Lay the strips out in chains; returns the plan, the number of indices and of joins.
 
@@ -184,7 +185,7 @@ def plan(faces, starts, ends, vertex_count, apart, keep_places):
     return out, total, joins
 
 
-@njit(cache=True, nogil=True)
+@helper
 def write_strip(faces, turns, begin, end, way, corner, base, at, out):
     """Write one strip at out[at:], whose place 0 is `base`; returns where it ends."""
     count = end - begin
@@ -217,7 +218,7 @@ def write_strip(faces, turns, begin, end, way, corner, base, at, out):
     return at
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write(faces, turns, starts, out_plan, restart, stitched, out):
     """Write strips by a plan, `restart` between those not joined or, `stitched`, two repeated vertices."""
     at = 0

@@ -1,9 +1,11 @@
 """Cut an object tree into ranges of leaves: the loop behind partition/cut.py."""
 
-from numba import njit
+import numpy as np
+
+from striptools.kernels.compiled import helper, kernel
 
 
-@njit(cache=True, nogil=True)
+@helper
 def meets_few(faces, order, begin, end, seen, stamp, most):
     """Whether the faces order[begin:end] have at most `most` different vertices; marks them with `stamp`."""
     count = 0
@@ -18,7 +20,7 @@ def meets_few(faces, order, begin, end, seen, stamp, most):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
     """Write the first positions of the largest subtrees within both limits; returns how many there are.
 
@@ -26,8 +28,9 @@ def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
     only items count.
     """
     count = 0
-    node = 0
-    begin = 0
+    # Their type from the start: for a bare 0 Numba would compile meets_few once more.
+    node = np.int64(0)
+    begin = np.int64(0)
     while begin < order.shape[0]:
         items = size[node]
         fits = items == 1
@@ -46,7 +49,7 @@ def cut_ranges(size, order, faces, seen, most_items, most_vertices, starts):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def group_strips(size, order, starts, faces, seen, most_triangles, most_vertices, firsts):
     """Write the first places of the largest subtrees over strips within both limits; returns how many.
 

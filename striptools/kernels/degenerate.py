@@ -1,7 +1,8 @@
 """Sort faces into usable, broken and doubtful ones with one pass of float64 arithmetic."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import kernel
 
 USABLE = 0
 NON_FINITE = 1
@@ -18,7 +19,7 @@ between 2^-298 and 2^258.
 """
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def classify_faces(positions, faces, begin, end, verdict):
     """Write one of the constants above to `verdict`, `(n,)` uint8, for the faces `begin:end`.
 

@@ -7,10 +7,11 @@ is no node.
 """
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def strip_ranges(left_count, strip_count):
     """Give each inner node its first strip and its number of strips, or name the first node that cannot be.
 
@@ -51,7 +52,7 @@ def strip_ranges(left_count, strip_count):
     return first, count, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def expanded_sizes(left_count, first, count, starts):
     """Lay out one tree over all triangles: the hierarchy over strips, then balanced halves in each strip.
 
@@ -102,7 +103,7 @@ def expanded_sizes(left_count, first, count, starts):
     return size, place
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def boxes_from_below(size, leaf_boxes):
     """Box every node of a preorder tree over one item a leaf, children before parents.
 

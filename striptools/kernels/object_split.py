@@ -11,9 +11,9 @@ Centres are twice the box centre (lo + hi) in float64, where the sum of two floa
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
 from striptools.kernels.boxes import half_area
+from striptools.kernels.compiled import helper, inlined, kernel, maker
 
 Rows = namedtuple("Rows", "boxes numbers words")
 """Three views of one array of n rows: (n, 8) float32, of which the first six are the box; (n, 8) int32, of
@@ -39,7 +39,7 @@ ALIGNED_BLOCKS = 12
 EMPTY_BOX = (np.float32(np.inf),) * 3 + (np.float32(-np.inf),) * 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_rows(boxes, weights, begin, end, rows):
     """Write the rows of the items `begin:end`; weights of no entry stand for 1 each.
 
@@ -64,13 +64,13 @@ def fill_rows(boxes, weights, begin, end, rows):
     return -1
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def centre(boxes, position, axis):
     """Twice the centre of a box along an axis."""
     return np.float64(boxes[position, axis]) + np.float64(boxes[position, 3 + axis])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def join(box, boxes, row):
     """The box (a tuple of six, kept in registers) around a box and a row of boxes."""
     return (
@@ -83,19 +83,19 @@ def join(box, boxes, row):
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def row_box(boxes, row):
     """A row of boxes as a tuple."""
     return (boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3], boxes[row, 4], boxes[row, 5])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def area(box):
     """Half area of a box that is not empty."""
     return half_area(box[0], box[1], box[2], box[3], box[4], box[5])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def grow_bounds(bounds, side, x, y, z):
     """Make the bounds of a side (rows least x y z, most x y z) hold a centre."""
     bounds[side, 0] = min(bounds[side, 0], x)
@@ -106,7 +106,7 @@ def grow_bounds(bounds, side, x, y, z):
     bounds[side, 5] = max(bounds[side, 5], z)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def clear_bounds(bounds):
     """Make all bounds hold nothing."""
     for side in range(bounds.shape[0]):
@@ -115,7 +115,7 @@ def clear_bounds(bounds):
             bounds[side, 3 + axis] = -np.inf
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def centre_bounds(boxes, begin, end, bounds):
     """Fill the first row of bounds with those of the centres of a range."""
     clear_bounds(bounds)
@@ -125,14 +125,14 @@ def centre_bounds(boxes, begin, end, bounds):
         )
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def bin_scale(bounds, axis, bins):
     """What makes the bins of an axis one apart; 0 where all centres are equal."""
     extent = bounds[0, 3 + axis] - bounds[0, axis]
     return bins / extent if extent > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def put_in_bin(bins, row, box, weight):
     """Make a bin hold an item."""
     bins.weight[row] += weight
@@ -144,7 +144,7 @@ def put_in_bin(bins, row, box, weight):
     bins.boxes[row, 5] = max(bins.boxes[row, 5], box[5])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def fill_bins(rows, begin, end, bounds, bins):
     """Sort a range into bins on all three axes at once."""
     # Make every bin hold nothing.
@@ -171,7 +171,7 @@ def fill_bins(rows, begin, end, bounds, bins):
         put_in_bin(bins, 2 * count + z_bin, box, weight)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def best_bin(bounds, bins):
     """The axis and the last bin on the left of the cheapest split; axis -1 where all centres are equal."""
     count = bins.right_cost.shape[0]
@@ -210,7 +210,7 @@ def best_bin(bounds, bins):
     return best_axis, best_slot
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def partition(rows, begin, end, axis, last_left, bin_count, bounds, spare, sides):
     """Move items in bins after `last_left` behind the others, both in order; returns the middle.
 
@@ -247,7 +247,7 @@ def partition(rows, begin, end, axis, last_left, bin_count, bounds, spare, sides
     return middle
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def load_short(rows, begin, count, short):
     """Copy a short range to `short`, and rank it by centre on each axis, equals in order."""
     for i in range(count):
@@ -269,7 +269,7 @@ def load_short(rows, begin, count, short):
             short.rank[axis, short.before[i]] = i
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def sweep(short, begin, end):
     """The axis and the place (the first on the right) of the cheapest split over all places of all axes.
 
@@ -306,7 +306,7 @@ def sweep(short, begin, end):
     return best_axis, best_place
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def part_ranks(short, begin, end, axis, place):
     """Part the ranks of the other axes as the split at `place` of `axis` parts it, all in order."""
     for j in range(begin, end):
@@ -327,7 +327,7 @@ def part_ranks(short, begin, end, axis, place):
             short.rank[other, left + k] = short.rank[3, k]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def rank_by_place(rank, begin, end):
     """Rank a range by place instead of centre, on all axes."""
     for j in range(begin + 1, end):
@@ -342,7 +342,7 @@ def rank_by_place(rank, begin, end):
         rank[2, j] = rank[0, j]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def finish_leaf(rows, tree, node, first, place, i):
     """Put row `first + i` into the leaf `node`, the one at `place`."""
     item = rows.numbers[first + i, ITEM]
@@ -351,7 +351,7 @@ def finish_leaf(rows, tree, node, first, place, i):
     tree.leaf_node[item] = node
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def finish_few(rows, tree, node, first, begin, count, rank, axis):
     """Finish the node over the one or two rows that `rank[axis]` has from `begin` on, in their order."""
     if count == 1:
@@ -365,7 +365,7 @@ def finish_few(rows, tree, node, first, begin, count, rank, axis):
         finish_leaf(rows, tree, node + 2, first, first + begin + 1, max(i, j))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def split_short(rows, tree, node, first, count, depth, sah_depth, short):
     """Split the range of `node` over 3 rows and more, the first of them `first`, down to single items."""
     load_short(rows, first, count, short)
@@ -414,7 +414,7 @@ def split_short(rows, tree, node, first, count, depth, sah_depth, short):
         depth = short.stack[waiting, 3]
 
 
-@njit(cache=True, nogil=True)
+@maker
 def room_for_short(longest):
     """Room to split a short range of `longest` items."""
     return Short(
@@ -429,25 +429,52 @@ def room_for_short(longest):
     )
 
 
-@njit(cache=True, nogil=True)
-def aligned_place(rows, begin, end, bounds, block, right_cost):
+@maker
+def rising(keys, order, other):
+    """The places of keys (n,) float64 in rising order, equals by place; order, other (n,) int64 are room."""
+    count = keys.shape[0]
+    for i in range(count):
+        order[i] = i
+    width = 1
+    while width < count:
+        # Merge each two neighbouring runs of so many places.
+        for begin in range(0, count, 2 * width):
+            i = begin
+            middle = begin + width if begin + width < count else count
+            j = middle
+            end = middle + width if middle + width < count else count
+            for k in range(begin, end):
+                if i < middle and (j == end or keys[order[i]] <= keys[order[j]]):
+                    other[k] = order[i]
+                    i += 1
+                else:
+                    other[k] = order[j]
+                    j += 1
+        order, other = other, order
+        width *= 2
+    return order
+
+
+@maker
+def aligned_place(rows, begin, end, bounds, block, right_cost, goes_right):
     """Find the cheapest place, over three axes, that splits a range without asking for one block more.
 
     Returns:
-        How many items go left (0 where all centres are equal), and their positions in the order of the axis.
+        How many items go left (0 where all centres are equal); goes_right (count,) bool tells of each place.
     """
     count = end - begin
     blocks = (count + block - 1) // block
     best = np.inf
     best_place = 0
-    best_rank = np.empty(0, np.int64)
     keys = np.empty(count, np.float64)
+    order = np.empty(count, np.int64)
+    other = np.empty(count, np.int64)
     for axis in range(3):
         if not bounds[0, 3 + axis] > bounds[0, axis]:
             continue
         for i in range(count):
             keys[i] = centre(rows.boxes, begin + i, axis)
-        rank = np.argsort(keys, kind="mergesort")
+        rank = rising(keys, order, other)
         # Gather the cost of the right side of each place.
         box = EMPTY_BOX
         weight = 0
@@ -458,6 +485,7 @@ def aligned_place(rows, begin, end, bounds, block, right_cost):
         # Sweep from the left and keep the first of the cheapest places that are allowed.
         box = EMPTY_BOX
         weight = 0
+        best_here = 0
         for place in range(1, count):
             box = join(box, rows.boxes, begin + rank[place - 1])
             weight += rows.numbers[begin + rank[place - 1], WEIGHT]
@@ -465,22 +493,24 @@ def aligned_place(rows, begin, end, bounds, block, right_cost):
                 cost = area(box) * weight + right_cost[place]
                 if cost < best:
                     best = cost
-                    best_place = place
-                    best_rank = rank
-    return best_place, best_rank
+                    best_here = place
+        # Note the sides while the order is known.
+        if best_here > 0:
+            best_place = best_here
+            for j in range(count):
+                goes_right[rank[j]] = j >= best_here
+    return best_place
 
 
-@njit(cache=True, nogil=True)
+@maker
 def align(rows, begin, end, bounds, block, right_cost, spare, sides):
     """Split a range of few blocks so that they fill well; returns the middle, or `begin` where none is found.
 
     Rows move like those of `partition`: stably, with the bounds of the centres on both sides.
     """
-    place, rank = aligned_place(rows, begin, end, bounds, block, right_cost)
-    if place == 0:
+    goes_right = np.empty(end - begin, np.bool_)
+    if aligned_place(rows, begin, end, bounds, block, right_cost, goes_right) == 0:
         return begin
-    goes_right = np.ones(end - begin, np.bool_)
-    goes_right[rank[:place]] = False
     clear_bounds(sides)
     middle = begin
     waiting = 0
@@ -506,7 +536,7 @@ def align(rows, begin, end, bounds, block, right_cost, spare, sides):
     return middle
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sah_depth, block, grain, jobs):
     """Split the range of `node` down to single items, or to ranges of at most `grain` items.
 
@@ -600,7 +630,7 @@ def split_ranges(rows, tree, node, begin, end, depth, bin_count, sweep_below, sa
     return job_count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def depths(parent):
     """Inner nodes above each node of a preorder tree, (2n-1,) int32."""
     depth = np.empty(parent.shape[0], np.int32)
@@ -610,7 +640,7 @@ def depths(parent):
     return depth
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_broken_node(parent, size):
     """The first node whose size, children or parent break the preorder layout; -1 where none does."""
     nodes = size.shape[0]

@@ -6,8 +6,8 @@ and cells are counted from both.
 """
 
 import numpy as np
-from numba import njit
 
+from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.object_split import (
     ITEM,
@@ -30,7 +30,7 @@ LOW = 16
 MOST_PLANE = 255
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def rounding_error(a, b):
     """What the float64 difference a - b lacks of the exact one (Shewchuk's Two-Diff)."""
     x = a - b
@@ -39,7 +39,7 @@ def rounding_error(a, b):
     return (a - a_virtual) + (b_virtual - b)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def cells_down(value, low, per_unit):
     """The last border of cells that is not above a float32 value, exactly; `low` is border 0."""
     a = np.float64(value)
@@ -50,7 +50,7 @@ def cells_down(value, low, per_unit):
     return np.int64(whole) - (1 if short else 0)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def cells_up(value, low, per_unit):
     """The first border of cells that is not below a float32 value, exactly; `low` is border 0."""
     a = np.float64(value)
@@ -61,7 +61,7 @@ def cells_up(value, low, per_unit):
     return np.int64(whole) + (1 if short else 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write_planes(record, boxes, children, child_in, low, per_unit, cells):
     """Write the origin, the shifts and the planes of a record; returns the three shifts.
 
@@ -107,7 +107,7 @@ def write_planes(record, boxes, children, child_in, low, per_unit, cells):
     return shifts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def room_for_emission():
     """Room for `emit_nodes`: stacks of `gather_children`, children, their lanes, and cells."""
     return (
@@ -121,7 +121,7 @@ def room_for_emission():
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def emit_nodes(
     boxes,
     size,
@@ -222,7 +222,7 @@ def emit_nodes(
     return free
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_strip(boxes, begin, end, longest, price, cost, back):
     """Choose the runs of one strip: least sum of half areas and of a price a run.
 
@@ -249,7 +249,7 @@ def cut_strip(boxes, begin, end, longest, price, cost, back):
         cost[place] = best + price
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_block(boxes, strip_starts, strip, begin, end, longest, price, cost, back, run_first, run_count):
     """Cut the strips of a block into runs.
 
@@ -295,7 +295,7 @@ def cut_block(boxes, strip_starts, strip, begin, end, longest, price, cost, back
     return runs, strip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def build_blocks(
     boxes,
     block_starts,
@@ -400,7 +400,7 @@ def build_blocks(
     return free - roots, written
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def build_top(boxes, size, items, low, per_unit, words, records, order):
     """Write the nodes over blocks.
 
@@ -426,7 +426,7 @@ def build_top(boxes, size, items, low, per_unit, words, records, order):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def slot_children(words, top_count, first_run, child):
     """Write what each slot holds: a node, a run (of all runs) as -(run + 1), or `EMPTY`.
 
@@ -458,7 +458,7 @@ def slot_children(words, top_count, first_run, child):
                 leaf += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def exact_boxes(child, leaf_first, leaf_count, triangle_boxes):
     """The exact box of what each slot holds, inside out in empty slots: (m, 6, 8) float32.
 
@@ -490,7 +490,7 @@ def exact_boxes(child, leaf_first, leaf_count, triangle_boxes):
     return boxes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_visiting_order(child, boxes):
     """Renumber nodes such that those visited together lie together, parents first.
 

@@ -7,6 +7,7 @@ Rays that miss every child of the root end here, and never reach the device. The
 import numpy as np
 from numba import njit
 
+from striptools.kernels.compiled import helper, kernel
 from striptools.kernels.wide import EMPTY, WIDTH
 
 ROW = 24
@@ -22,38 +23,38 @@ SLACK = np.float32(1 + 2**-20)
 HIGHEST_BIT = np.array([max(k.bit_length() - 1, 0) for k in range(2**WIDTH)], np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def flushed(value):
     """Zero for a denormal float32; what is not a number stays so."""
     return ZERO if abs(value) < LEAST_NORMAL else value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def smaller(a, b):
     """The smaller of two, b where they do not compare."""
     return a if a < b else b
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def larger(a, b):
     """The larger of two, b where they do not compare."""
     return a if a > b else b
 
 
-@njit(cache=True, nogil=True)
+@helper
 def picked(x, y, z, axis):
     """The coordinate along an axis."""
     return x if axis == 0 else (y if axis == 1 else z)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def steep(way):
     """A direction component, or a tiny one of the same sign for one too small to cross the scene."""
     tiny = -TINY if way < ZERO else TINY
     return tiny if abs(way) < TINY else way
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
     """The root's lanes that a ray meets, as bits in the order of visits, the nearest highest."""
     lanes = np.int32(0)

@@ -1,10 +1,11 @@
 """Walk tables whose rows hold lists, such as those of a PLY file, without trusting their lengths."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel
 
 
-@njit(cache=True, nogil=True)
+@helper
 def read_integer(stream, place, width, big_endian, signed):
     """The integer of `width` bytes at `place`; unsigned ones of 8 bytes saturate."""
     value = np.uint64(0)
@@ -18,7 +19,7 @@ def read_integer(stream, place, width, big_endian, signed):
     return np.int64(value)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk_bytes(stream, place, rows, layout, big_endian, target, starts, lengths):
     """Walk `rows` binary rows; note where the list of column `target` begins in each, and its length.
 
@@ -56,7 +57,7 @@ def walk_bytes(stream, place, rows, layout, big_endian, target, starts, lengths)
     return place, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk_numbers(stream, place, rows, lists, target, starts, lengths):
     """The same for rows of numbers in a float64 array; `lists` says which columns are lists."""
     for row in range(rows):
@@ -79,7 +80,7 @@ def walk_numbers(stream, place, rows, lists, target, starts, lengths):
     return place, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather_runs(stream, starts, lengths):
     """Copy the runs `stream[starts[k] : starts[k] + lengths[k]]` one after another."""
     total = np.int64(0)

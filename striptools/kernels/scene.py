@@ -1,17 +1,18 @@
 """Loops over the arrays of a scene: gathering, and the rules that a scene file keeps."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather_items(items, chosen, begin, end, out):
     """Copy the items `chosen[begin:end]` to their places in out."""
     for k in range(begin, end):
         out[k] = items[chosen[k]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_row_off_grid(rows, per_unit):
     """The first of the rows of (q, 3) float32 with an entry that is no multiple of 1 / per_unit, or -1."""
     for k in range(rows.shape[0]):
@@ -23,7 +24,7 @@ def first_row_off_grid(rows, per_unit):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def has_repeat(items, seen):
     """Whether an item stands twice; every item is a place in seen, all False."""
     for k in range(items.shape[0]):

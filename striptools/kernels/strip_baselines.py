@@ -7,6 +7,7 @@ of a free face is the number of its joins. A half-edge is 3 * face + slot.
 import numpy as np
 from numba import njit
 
+from striptools.kernels.compiled import helper, kernel, maker
 from striptools.kernels.strip_topology import slots_after
 
 NONE = -1
@@ -20,7 +21,7 @@ def _is_join(faces, free, h, g):
     return u != f and free[u] and faces[f, h % 3] != faces[u, g % 3]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _unlink(face, degree, first, last, before, after):
     """Take a face out of the list of its degree."""
     b = before[face]
@@ -35,7 +36,7 @@ def _unlink(face, degree, first, last, before, after):
         before[a] = b
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _append(face, degree, first, last, before, after):
     """Put a face at the end of the list of its degree."""
     end = last[degree[face]]
@@ -48,7 +49,7 @@ def _append(face, degree, first, last, before, after):
         after[end] = face
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take(face, ring, faces, free, degree, first, last, before, after):
     """Take a face out of the free ones; each of its joins costs its neighbour a degree."""
     _unlink(face, degree, first, last, before, after)
@@ -64,7 +65,7 @@ def _take(face, ring, faces, free, degree, first, last, before, after):
             g = ring[g]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _look_ahead(u, entry, ring, faces, free, degree, nothing):
     """The least degree among the joins that face u has left when entered by a half-edge."""
     least = nothing
@@ -77,7 +78,7 @@ def _look_ahead(u, entry, ring, faces, free, degree, nothing):
     return least
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _best_step(face, entry, ring, faces, free, degree, nothing):
     """The half-edges by which a strip leaves a face and enters the next one, (-1, -1) where it ends."""
     leave = NONE
@@ -102,7 +103,7 @@ def _best_step(face, entry, ring, faces, free, degree, nothing):
     return leave, enter
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def stripe_like(ring, faces, most, order, starts):
     """Write the faces strip after strip into order (n,) and starts (n+1,); returns the number of strips."""
     count = faces.shape[0]
@@ -161,7 +162,7 @@ def stripe_like(ring, faces, most, order, starts):
     return strips
 
 
-@njit(cache=True, nogil=True)
+@maker
 def corners_of_vertices(faces, vertex_count):
     """Where the corners of each vertex stand: first (v+1,), corner (3n,) = 3 * face + slot, ascending."""
     first = np.zeros(vertex_count + 1, np.int32)
@@ -182,13 +183,13 @@ def corners_of_vertices(faces, vertex_count):
     return first, corner
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _beside(c, side, faces):
     """The vertex of the face of corner c that comes right after (side 0) or right before (1) that corner."""
     return faces[c // 3, (c % 3 + 1 + side) % 3]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _way_on(v, begin, end, corner, faces, emitted, before):
     """How a fan round v goes on from the face `before`: its corner there and the side, (-1, 0) for nohow."""
     here = NONE
@@ -207,7 +208,7 @@ def _way_on(v, begin, end, corner, faces, emitted, before):
     return NONE, 0
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _turn_round(c, side, faces, emitted, head, link, order, position):
     """Emit the face of corner c, then its neighbours on one side round that vertex; returns the place."""
     while c != NONE:
@@ -224,7 +225,7 @@ def _turn_round(c, side, faces, emitted, head, link, order, position):
     return position
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _fan(v, faces, first, corner, emitted, head, pending, link, order, position):
     """Emit every face round vertex v that is not yet emitted, in runs of neighbours; returns the place.
 
@@ -260,7 +261,7 @@ def _fan(v, faces, first, corner, emitted, head, pending, link, order, position)
     return position
 
 
-@njit(cache=True, nogil=True)
+@helper
 def _next_vertex(begin, end, stack, live, stamp, time, cache_size):
     """The best fanning vertex among stack[begin:end]: the oldest that stays cached while it is fanned."""
     best = NONE
@@ -278,7 +279,7 @@ def _next_vertex(begin, end, stack, live, stamp, time, cache_size):
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tipsify(faces, vertex_count, cache_size, order):
     """Write the faces into order (n,) as Tipsify emits them."""
     count = faces.shape[0]
@@ -322,7 +323,7 @@ def tipsify(faces, vertex_count, cache_size, order):
         v = _next_vertex(begin, height, stack, live, stamp, time, cache_size)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_into_strips(faces, order, most, starts):
     """Cut an order of faces wherever one cannot follow the one before, or a strip is full.
 

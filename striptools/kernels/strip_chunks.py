@@ -7,9 +7,9 @@ tunnels, and writes the faces in strip order to the range's own slice of the out
 from math import frexp, ldexp
 
 import numpy as np
-from numba import njit
 
 from striptools.kernels.adjacency import ring_half_edges
+from striptools.kernels.compiled import helper, kernel, spliced
 from striptools.kernels.strip_linking import link_range
 from striptools.kernels.strip_ordering import walk_links
 from striptools.kernels.strip_tunnels import (
@@ -18,12 +18,13 @@ from striptools.kernels.strip_tunnels import (
     Strips,
     box_area,
     mirrors,
+    room_for_search,
     row_cost,
     search_range,
 )
 
 
-@njit(cache=True, nogil=True)
+@helper
 def gather_faces(faces, order, begin, end, number, gathered):
     """Copy the faces order[begin:end] with their vertices numbered by first use; returns how many there are.
 
@@ -44,7 +45,7 @@ def gather_faces(faces, order, begin, end, number, gathered):
     return count
 
 
-@njit(cache=True, nogil=True)
+@helper
 def gather_boxes(boxes, order, begin, end, gathered):
     """Copy the boxes of order[begin:end] in the form of strip_tunnels; returns the sum of their areas."""
     # Find the power of two that brings every coordinate below 1.
@@ -64,7 +65,7 @@ def gather_boxes(boxes, order, begin, end, gathered):
     return total
 
 
-@njit(cache=True, nogil=True)
+@spliced
 def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, order, starts):
     """Improve linked faces by tunnels and write them in strip order; returns strips, cost before and after.
 
@@ -90,7 +91,6 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, o
         starts[:strip_count].copy(),
         starts[1 : strip_count + 1] - starts[:strip_count],
         np.empty(strip_count, np.float64),
-        np.empty(strip_count, np.float64),
         np.empty(strip_count, np.int32),
         np.empty((count, 2), np.int32),
         mate,
@@ -99,8 +99,17 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, o
         for place in range(strips.length[s]):
             strips.where[rows[strips.begin[s] + place], 0] = s
             strips.where[rows[strips.begin[s] + place], 1] = place
-    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32), flips)
-    before, after = search_range(strips, ground, most, deepest, neutral, price, rise, passes, leaves)
+    ground = Ground(
+        ring,
+        faces,
+        boxes,
+        mirrors(),
+        np.empty((LONGEST, 6), np.float32),
+        np.empty(LONGEST, np.int32),
+        flips,
+    )
+    search = room_for_search(deepest, count, strip_count)
+    before, after = search_range(strips, ground, search, most, deepest, neutral, price, rise, passes, leaves)
     # Write the strips by the place of their first faces, each turned the cheaper way.
     k = 0
     written = 0
@@ -110,7 +119,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, o
             continue
         s = strips.where[face, 0]
         begin = strips.begin[s]
-        length = strips.length[s]
+        length = np.int64(strips.length[s])
         starts[written] = k
         written += 1
         for place in range(length):
@@ -118,7 +127,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, o
         if length <= LONGEST:
             for place in range(length):
                 turned[place] = rows[begin + length - 1 - place]
-            other = row_cost(turned, 0, length, boxes, ground.mirror, ground.room)
+            other = row_cost(turned, np.int64(0), length, boxes, ground.mirror, ground.room)
             if other < strips.kept[s]:
                 order[k : k + length] = turned[:length]
                 after += other - strips.kept[s]
@@ -127,7 +136,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, o
     return written, before, after
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def order_ranges(
     faces,
     boxes,

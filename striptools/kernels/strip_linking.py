@@ -5,15 +5,15 @@ half-edge, or -1; `links` (n,) uint8 the links of each face.
 """
 
 import numpy as np
-from numba import njit
 
+from striptools.kernels.compiled import helper, inlined, kernel
 from striptools.kernels.strip_topology import may_flip
 
 CLASSES = 128
 """Two classes an octave of subtree sizes, each for edges of two faces and of more."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def size_class(count):
     """Which of the classes a subtree of `count` >= 2 items falls in: two an octave."""
     octave = 0
@@ -22,7 +22,7 @@ def size_class(count):
     return 2 * octave + (count >> (octave - 1) & 1)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def common_size(a, b, parent, size):
     """Items below the lowest node that holds both nodes."""
     while not a <= b < a + 2 * size[a] - 1:
@@ -30,7 +30,7 @@ def common_size(a, b, parent, size):
     return size[a]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def may_link(faces, h, g, flips):
     """Whether half-edges h and g of one edge may be linked: run in opposite directions, or with a flip."""
     if faces[h // 3, h % 3] != faces[g // 3, g % 3]:
@@ -38,7 +38,7 @@ def may_link(faces, h, g, flips):
     return flips and may_flip(faces, h // 3, g // 3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def link_range(ring, faces, leaf, parent, size, most, flips, mate, links):
     """Link the faces of a range into paths of at most `most` faces, the nearest in the tree first.
 

@@ -14,6 +14,8 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
+from striptools.kernels.compiled import helper, kernel
+
 State = namedtuple("State", "ends length node level owner mate links")
 """ends (n, 2) the end faces of each sequence; length (n,) its faces, 0 once joined to another; node (n,) its
 tree node and level (n,) the depth of that; owner (n,) the sequence of a face, right at ends only; mate (3n,)
@@ -23,7 +25,7 @@ Proposals = namedtuple("Proposals", "partner score leave enter")
 """By sequence: whom it wants to join (-1 no one), how much, and through which two half-edges."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def renumber(faces, ring, order, place, new_faces, new_ring):
     """Number faces and half-edges by place: face order[i] becomes face i, order[place[f]] = f."""
     for i in range(order.shape[0]):
@@ -56,7 +58,7 @@ def may_join(s, h, g, faces, length, owner, mate, links, most):
     return r != s and length[r] + length[s] <= most
 
 
-@njit(cache=True, nogil=True)
+@helper
 def comes_before(score, s, r, best_score, best_s, best_r):
     """Whether a pair is better than the best so far: higher score, then smaller pair of indices."""
     if score != best_score:
@@ -193,7 +195,7 @@ def best_proposal(x, partner, score, taken, first_suitor, next_suitor):
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def match(active, wanted, taken, first_suitor, next_suitor, path, accepted):
     """Accept proposals from the best down, each that meets two free sequences; returns how many.
 
@@ -237,7 +239,7 @@ def match(active, wanted, taken, first_suitor, next_suitor, path, accepted):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join(accepted, wanted, state, parent, size):
     """Join the two sequences of each accepted proposal under the smaller name."""
     for p in accepted:
@@ -269,7 +271,7 @@ def join(accepted, wanted, state, parent, size):
         state.owner[other] = low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def still_active(active, wanted, state):
     """Keep, in place, the sequences that found a join this round and still stand; returns how many."""
     count = 0
@@ -280,7 +282,7 @@ def still_active(active, wanted, state):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def longest_ring(ring):
     """The most half-edges on one ring."""
     longest = 1
@@ -295,7 +297,7 @@ def longest_ring(ring):
     return longest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk_links(mate, links, order, starts):
     """Write the faces of each sequence in a row, from its end of smaller index; returns how many."""
     done = np.zeros(links.shape[0], np.bool_)

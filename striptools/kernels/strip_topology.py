@@ -5,7 +5,8 @@ Sets of slots are bit masks (bit k for slot k). Slot k of a face is its edge fro
 """
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, inlined, kernel
 
 ALL_SLOTS = 7
 
@@ -34,7 +35,7 @@ USABLE = np.array([_usable_crossings(entered) for entered in range(8)], np.int64
 ENTRIES_BEFORE = np.array([_entries_before(leaving) for leaving in range(8)], np.int64)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def crossings(faces, t, u):
     """The ways from face t to face u, edges run in opposite directions: a set of bits 3 * leave + enter."""
     a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -46,7 +47,7 @@ def crossings(faces, t, u):
     return ways
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def may_flip(faces, t, u):
     """Whether a strip may cross from face t to face u by an edge that both run the same way.
 
@@ -56,20 +57,20 @@ def may_flip(faces, t, u):
     return crossings(faces, t, u) == 0
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def slots_entered(ways):
     """The slots of the second face that a set of crossings enters by."""
     return (ways | ways >> 3 | ways >> 6) & ALL_SLOTS
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def slots_left(ways, entered):
     """The slots of the first face by which a set of crossings comes to slot `entered` of the second."""
     ways >>= entered
     return ways & 1 | ways >> 2 & 2 | ways >> 4 & 4
 
 
-@njit(cache=True, nogil=True)
+@helper
 def slots_after(faces, t, entered, u):
     """The set of slots face u can be entered by from face t, itself entered by one of the set `entered`.
 
@@ -79,7 +80,7 @@ def slots_after(faces, t, entered, u):
     return slots_entered(crossings(faces, t, u) & USABLE[entered])
 
 
-@njit(cache=True, nogil=True)
+@helper
 def longest_strip(starts, first, last):
     """The most faces of the strips `first:last`, at least 1."""
     longest = 1
@@ -88,7 +89,7 @@ def longest_strip(starts, first, last):
     return longest
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def gather_strip(faces, order, begin, end, rows):
     """Copy the faces `order[begin:end]` to rows, where the passes that follow find them in order."""
     for k in range(begin, end):
@@ -96,13 +97,13 @@ def gather_strip(faces, order, begin, end, rows):
             rows[k - begin, corner] = faces[order[k], corner]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def flip(rows, k):
     """Swap the first two corners of a row."""
     rows[k, 0], rows[k, 1] = rows[k, 1], rows[k, 0]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def choose_strip(rows, count, flips_allowed, ways, entries, flipped):
     """Fill entries (count,) with the slot each row is entered by, 3 for the first; ways with all crossings.
 
@@ -139,7 +140,7 @@ def choose_strip(rows, count, flips_allowed, ways, entries, flipped):
     return broken
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_break(faces, order, starts, flips_allowed):
     """The first position of any strip that its predecessor cannot lead to, -1 where all can."""
     longest = longest_strip(starts, 0, starts.shape[0] - 1)
@@ -156,7 +157,7 @@ def first_break(faces, order, starts, flips_allowed):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def encode(faces, order, starts, first, last, flips_allowed, vertices, turns, rotation, flips):
     """Fill vertices (n + 2s,), turns (n,) and rotation (n,) of the strips `first:last`; set bits of flips.
 
@@ -205,7 +206,7 @@ def encode(faces, order, starts, first, last, flips_allowed, vertices, turns, ro
     return -1, any_flipped
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode(vertices, turns, starts, first, last, faces):
     """Fill faces (n, 3) with the triangles of strips `first:last`."""
     for strip in range(first, last):
@@ -224,7 +225,7 @@ def decode(vertices, turns, starts, first, last, faces):
             faces[k, 0], faces[k, 1], faces[k, 2] = a, b, c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def swap_flipped(flips, first, last, faces):
     """Swap the first two corners of those of the faces `first:last` whose bit is set."""
     for k in range(first, last):

@@ -1,7 +1,8 @@
 """Tunnels: chains of rotations that end in a merge, the loops behind strips/tunnelling.py.
 
-Faces of a range are numbered by their place in it. A *strip* is a row of faces, kept in an arena `rows`; new
-rows go to the arena's top, so that a rotation is undone by pointing back at the old row. A strip's *end* is
+Faces of a range are numbered by their place in it. A *strip* is a row of faces, kept in an arena `rows`;
+rows of changed strips go to the arena's top. While a chain is tried nothing is written there: a *virtual row*
+is a list of pieces of the arena, each run forwards or backwards. A strip's *end* is
 the last face of its row, its *head* the first. A *rotation* links the end t of strip a to an inner face u of
 strip b and cuts one of u's links; the part of b on the far side of the cut leaves b for a, and the face w
 at the near side is the new end. Within one strip (a = b) the cut must face t, or a ring would close.
@@ -13,9 +14,9 @@ scaled by a power of two to lie within -1 and 1, so that no area overflows float
 from collections import namedtuple
 
 import numpy as np
-from numba import njit
 
-from striptools.kernels.strip_topology import may_flip
+from striptools.kernels.compiled import helper, inlined, kernel, maker, spliced
+from striptools.kernels.strip_linking import may_link
 
 LONGEST = 256
 """Strips of more faces than this are left alone: an evaluation costs as much as its strips are long."""
@@ -23,27 +24,59 @@ LONGEST = 256
 MOST_ROTATIONS = 400
 """A search from one end gives up after this many rotations."""
 
+NONE = np.int64(-1)
+ZERO = np.int64(0)
+ONE = np.int64(1)
+FORWARDS = np.bool_(False)
+"""Constants of the types of variables: for a bare 0 Numba compiles once more what takes it."""
+
 TOP_WEIGHT = 4.0
 """What the hierarchy over the strips costs for a strip, in areas of the strip's box."""
 
-Ground = namedtuple("Ground", "ring faces boxes mirror room flips")
-"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`,
-room (LONGEST, 6) float32 for evaluations, and flips, whether edges may be run the same way by both faces."""
+Ground = namedtuple("Ground", "ring faces boxes mirror room line flips")
+"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`, for
+evaluations room (LONGEST, 6) float32 and line (LONGEST,) int32, and flips, whether edges may be run the same
+way by both faces."""
 
-Strips = namedtuple("Strips", "rows begin length cost kept changed where mate")
-"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, cost (s,) float64
-of the row it has now (negative: not known) and kept (s,) that of the last accepted one, and changed (s,)
-int32, when that was; where (n, 2) int32, strip and place of each face; mate (3n,) int32, the linked half-edge
-or -1."""
+Strips = namedtuple("Strips", "rows begin length kept changed where mate")
+"""The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, kept (s,) float64,
+its cost, and changed (s,) int32, when it was changed last; where (n, 2) int32, strip and place of each face;
+mate (3n,) int32, the linked half-edge or -1."""
 
-Search = namedtuple("Search", "level path saved touched best")
-"""Working room of one search: level (k, 4) int32 by depth: strip, slot, half-edge, side that are tried now;
-path (k, 10) int32, the rotations done: half-edges h, g, cut, its mate, then strip, begin, length of a and of
-b; saved (k, 2) float64 their costs; touched (k,) int32 strips; best (k, 3) int32 the rotations h, g, cut of
-the best find, then its merge."""
+Search = namedtuple("Search", "level path saved shape cost pieces moves best spare order tried first")
+"""Working room of one search:
+level (k, 4) int64 by depth: next move, how many there are, virtual row, its end face;
+path (k, 14) int64, the rotations done: half-edges h, g, cut, its mate, rows a and b, how many rows there
+were, begin, count, length of a and of b, top of the pieces; saved (k, 2) float64 the costs of a and b;
+shape (k, 4) int64 by virtual row: strip, begin and count of its pieces, length; cost (k,) float64 (negative:
+not known); pieces (p, 2) int64: first and last place in the arena;
+moves (k, MOST_ROTATIONS, 8) int64 by depth: half-edges h, g, cut, side of the cut, row b (-1: as it lies in
+the arena), its strip, place of u, new end w;
+best (k, 3) int64 the rotations h, g, cut of the best find, then its merge;
+for the passes: spare (n,) int32, order and tried (s,) int32, first (LONGEST + 2,) int32."""
 
 
-@njit(cache=True, nogil=True)
+@maker
+def room_for_search(deepest, faces, strips):
+    """Room for a search of so many rotations over so many faces in so many strips."""
+    depths = deepest + 2
+    return Search(
+        np.empty((depths, 4), np.int64),
+        np.empty((depths, 14), np.int64),
+        np.empty((depths, 2), np.float64),
+        np.empty((depths + 1, 4), np.int64),
+        np.empty(depths + 1, np.float64),
+        np.empty((2 * depths * (depths + 2), 2), np.int64),
+        np.empty((depths, MOST_ROTATIONS, 8), np.int64),
+        np.empty((depths, 3), np.int64),
+        np.empty(faces, np.int32),
+        np.empty(strips, np.int32),
+        np.empty(strips, np.int32),
+        np.empty(LONGEST + 2, np.int32),
+    )
+
+
+@kernel
 def mirrors():
     """The table of reversed bits: entry m + i is i < m, m a power of two, with its log2(m) bits reversed."""
     table = np.zeros(2 * LONGEST, np.int32)
@@ -57,7 +90,7 @@ def mirrors():
     return table
 
 
-@njit(cache=True, nogil=True, inline="always")
+@spliced
 def box_area(boxes, row):
     """Half area of a box."""
     x = boxes[row, 3] + boxes[row, 0]
@@ -66,7 +99,7 @@ def box_area(boxes, row):
     return np.float64(x * y + y * z + z * x)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@spliced
 def join_boxes(boxes, one, other, out, row):
     """Write the box around two to a row of `out`."""
     for q in range(6):
@@ -75,7 +108,7 @@ def join_boxes(boxes, one, other, out, row):
         out[row, q] = a if a > b else b
 
 
-@njit(cache=True, nogil=True)
+@helper
 def row_cost(rows, begin, length, boxes, mirror, room):
     """Areas of the inner nodes of the balanced tree over a row, and TOP_WEIGHT times that of its root.
 
@@ -110,7 +143,7 @@ def row_cost(rows, begin, length, boxes, mirror, room):
     return total + TOP_WEIGHT * box_area(room, 0)
 
 
-@njit(cache=True, nogil=True)
+@helper
 def relabel(rows, begin, first, length, strip, where):
     """Tell the faces of a row from place `first` on which strip they are in, and where."""
     for place in range(first, length):
@@ -119,192 +152,324 @@ def relabel(rows, begin, first, length, strip, where):
         where[face, 1] = place
 
 
-@njit(cache=True, nogil=True)
-def reverse(strips, a, top):
-    """Turn the row of strip a round in the arena's top; returns the new top."""
-    rows = strips.rows
-    begin = strips.begin[a]
-    length = strips.length[a]
-    for i in range(length):
-        rows[top + i] = rows[begin + length - 1 - i]
-    strips.begin[a] = top
-    relabel(rows, top, 0, length, a, strips.where)
-    return top + length
+@helper
+def append_places(pieces, begin, count, first, last, top):
+    """Write the pieces of the places first:last of a virtual row to the top; returns the new top."""
+    place = 0
+    for k in range(begin, begin + count):
+        one = pieces[k, 0]
+        step = 1 if pieces[k, 1] >= one else -1
+        faces = (pieces[k, 1] - one) * step + 1
+        low = max(first - place, 0)
+        high = min(last - place, faces)
+        if low < high:
+            pieces[top, 0] = one + step * low
+            pieces[top, 1] = one + step * (high - 1)
+            top += 1
+        place += faces
+    return top
 
 
-@njit(cache=True, nogil=True)
-def rotate(strips, path, saved, d, a, h, g, cut, top):
-    """Do a rotation of strip a's end and note at path[d] how to undo it; returns the new top."""
-    rows, begins, lengths, cost, where, mate = (
-        strips.rows, strips.begin, strips.length, strips.cost, strips.where, strips.mate,
-    )  # fmt: skip
-    u = g // 3
-    b = where[u, 0]
-    p = where[u, 1]
+@helper
+def turn_pieces(pieces, begin, end):
+    """Turn a virtual row round."""
+    while begin < end:
+        end -= 1
+        one = pieces[begin, 0]
+        other = pieces[begin, 1]
+        pieces[begin, 0] = pieces[end, 1]
+        pieces[begin, 1] = pieces[end, 0]
+        pieces[end, 0] = other
+        pieces[end, 1] = one
+        begin += 1
+
+
+@inlined
+def take_up(strips, search, used, s, top):
+    """Make strip s, as it lies in the arena, the virtual row `used`; returns the new top of the pieces."""
+    shape = search.shape
+    shape[used, 0] = s
+    shape[used, 1] = top
+    shape[used, 2] = 1
+    shape[used, 3] = strips.length[s]
+    search.pieces[top, 0] = strips.begin[s]
+    search.pieces[top, 1] = strips.begin[s] + strips.length[s] - 1
+    search.cost[used] = strips.kept[s]
+    return top + 1
+
+
+@inlined
+def locate(strips, search, used, face):
+    """The virtual row that holds a face (-1: its strip is as it lies in the arena) and the place there."""
+    where, shape, pieces = strips.where, search.shape, search.pieces
+    s = where[face, 0]
+    place = np.int64(where[face, 1])
+    found = NONE
+    known = False
+    for slot in range(used):
+        known = known or shape[slot, 0] == s
+    # Look for its place in the arena among the pieces.
+    if known:
+        x = strips.begin[s] + place
+        for slot in range(used):
+            before = 0
+            begin = shape[slot, 1]
+            for k in range(begin, begin + shape[slot, 2]):
+                one = pieces[k, 0]
+                other = pieces[k, 1]
+                if one <= x <= other or other <= x <= one:
+                    found = slot
+                    place = before + abs(x - one)
+                before += abs(other - one) + 1
+    return found, place
+
+
+@inlined
+def face_at(rows, search, slot, place):
+    """The face at a place of a virtual row."""
+    begin = search.shape[slot, 1]
+    face = NONE
+    for k in range(begin, begin + search.shape[slot, 2]):
+        one = search.pieces[k, 0]
+        other = search.pieces[k, 1]
+        faces = abs(other - one) + 1
+        if 0 <= place < faces:
+            face = rows[one + place] if other >= one else rows[one - place]
+        place -= faces
+    return face
+
+
+@inlined
+def write_row(rows, search, slot, backwards, out, k):
+    """Write the faces of a virtual row, forwards or from its end, to out from k on; returns the end."""
+    begin = search.shape[slot, 1]
+    count = search.shape[slot, 2]
+    for i in range(count):
+        if backwards:
+            other = search.pieces[begin + count - 1 - i, 0]
+            one = search.pieces[begin + count - 1 - i, 1]
+        else:
+            one = search.pieces[begin + i, 0]
+            other = search.pieces[begin + i, 1]
+        step = 1 if other >= one else -1
+        for x in range(abs(other - one) + 1):
+            out[k] = rows[one + step * x]
+            k += 1
+    return k
+
+
+@inlined
+def rotate(strips, search, d, used, a, b, p, side, h, g, cut, top):
+    """Do a rotation of virtual row a's end into place p of b, and note at path[d] how to undo it.
+
+    Side 0 cuts b before p, side 1 behind p. Returns the new top of the pieces.
+    """
+    path, shape, cost, pieces = search.path, search.shape, search.cost, search.pieces
+    mate = strips.mate
     back = mate[cut]
-    q = where[back // 3, 1]
-    begin = begins[a]
-    length = lengths[a]
-    # Note the strips as they are, and change the links.
+    # Note the rows as they are, and change the links.
     path[d, 0] = h
     path[d, 1] = g
     path[d, 2] = cut
     path[d, 3] = back
     path[d, 4] = a
-    path[d, 5] = begin
-    path[d, 6] = length
-    path[d, 7] = b
-    path[d, 8] = begins[b]
-    path[d, 9] = lengths[b]
-    saved[d, 0] = cost[a]
-    saved[d, 1] = cost[b]
+    path[d, 5] = b
+    path[d, 6] = used
+    for k in range(3):
+        path[d, 7 + k] = shape[a, 1 + k]
+        path[d, 10 + k] = shape[b, 1 + k]
+    search.saved[d, 0] = cost[a]
+    search.saved[d, 1] = cost[b]
     mate[cut] = -1
     mate[back] = -1
     mate[h] = g
     mate[g] = h
-    # Write strip a's row anew: what stays in place, then the part beyond the link.
-    k = top
-    if a == b:
-        for i in range(p + 1):
-            rows[k] = rows[begin + i]
-            k += 1
-        for i in range(length - 1, p, -1):
-            rows[k] = rows[begin + i]
-            k += 1
-        begins[a] = top
-        cost[a] = -1.0
-        relabel(rows, top, p + 1, length, a, where)
-        return k
-    for i in range(length):
-        rows[k] = rows[begin + i]
-        k += 1
-    other = begins[b]
-    rest = lengths[b]
-    if q < p:
-        for i in range(p, rest):
-            rows[k] = rows[other + i]
-            k += 1
-    else:
-        for i in range(p, -1, -1):
-            rows[k] = rows[other + i]
-            k += 1
-    begins[a] = top
-    lengths[a] = k - top
-    relabel(rows, top, length, k - top, a, where)
-    # Leave strip b the rest, its new end last.
-    if q < p:
-        lengths[b] = p
-    else:
-        begins[b] = k
-        lengths[b] = rest - 1 - p
-        for i in range(rest - 1, p, -1):
-            rows[k] = rows[other + i]
-            k += 1
-        relabel(rows, begins[b], 0, lengths[b], b, where)
+    begin = shape[a, 1]
+    length = shape[a, 3]
     cost[a] = -1.0
     cost[b] = -1.0
-    return k
+    shape[a, 1] = top
+    # Within one strip, turn round what is behind the link.
+    if a == b:
+        middle = append_places(pieces, begin, shape[a, 2], ZERO, p + 1, top)
+        end = append_places(pieces, begin, shape[a, 2], p + 1, length, middle)
+        turn_pieces(pieces, middle, end)
+        shape[a, 2] = end - top
+    else:
+        # Append the part beyond the link to row a.
+        other = shape[b, 1]
+        count = shape[b, 2]
+        rest = shape[b, 3]
+        low = p if side == 0 else ZERO
+        high = rest if side == 0 else p + 1
+        middle = append_places(pieces, begin, shape[a, 2], ZERO, length, top)
+        end = append_places(pieces, other, count, low, high, middle)
+        if side == 1:
+            turn_pieces(pieces, middle, end)
+        shape[a, 2] = end - top
+        shape[a, 3] = length + high - low
+        # Leave row b the rest, its new end last.
+        top = end
+        low = ZERO if side == 0 else p + 1
+        high = p if side == 0 else rest
+        end = append_places(pieces, other, count, low, high, top)
+        if side == 1:
+            turn_pieces(pieces, top, end)
+        shape[b, 1] = top
+        shape[b, 2] = end - top
+        shape[b, 3] = high - low
+    return end
 
 
-@njit(cache=True, nogil=True)
-def undo(strips, path, saved, d):
-    """Undo the rotation of path[d]; returns the top as it was before."""
-    top = strips.begin[path[d, 4]]
+@inlined
+def undo(strips, search, d):
+    """Undo the rotation of path[d]; returns how many virtual rows there were before."""
+    path, shape = search.path, search.shape
     mate = strips.mate
     mate[path[d, 0]] = -1
     mate[path[d, 1]] = -1
     mate[path[d, 2]] = path[d, 3]
     mate[path[d, 3]] = path[d, 2]
-    # Point at the old rows, and let the faces that moved know.
-    for k in range(2):
-        s = path[d, 4 + 3 * k]
-        strips.begin[s] = path[d, 5 + 3 * k]
-        strips.length[s] = path[d, 6 + 3 * k]
-        strips.cost[s] = saved[d, k]
-    b = path[d, 7]
-    relabel(strips.rows, strips.begin[b], 0, strips.length[b], b, strips.where)
-    return top
+    a = path[d, 4]
+    b = path[d, 5]
+    for k in range(3):
+        shape[a, 1 + k] = path[d, 7 + k]
+        shape[b, 1 + k] = path[d, 10 + k]
+    search.cost[a] = search.saved[d, 0]
+    search.cost[b] = search.saved[d, 1]
+    return path[d, 6]
 
 
-@njit(cache=True, nogil=True)
-def known_cost(strips, ground, s):
-    """The cost of strip s's row, worked out where it is not known."""
-    if strips.cost[s] < 0.0:
-        strips.cost[s] = row_cost(
-            strips.rows, strips.begin[s], strips.length[s], ground.boxes, ground.mirror, ground.room
-        )
-    return strips.cost[s]
-
-
-@njit(cache=True, nogil=True)
-def change_of(strips, ground, touched, count, skip, other):
-    """By how much the strips touched[:count], each once, have become dearer; two of them count as gone."""
+@inlined
+def change_of(strips, ground, search, used, skip, other):
+    """By how much the virtual rows, but for two that are gone, are dearer than the strips were."""
     change = 0.0
-    for i in range(count):
-        s = touched[i]
-        again = False
-        for j in range(i):
-            again = again or touched[j] == s
-        if again:
-            continue
-        change -= strips.kept[s]
-        if s != skip and s != other:
-            change += known_cost(strips, ground, s)
+    for slot in range(used):
+        change -= strips.kept[search.shape[slot, 0]]
+        if slot != skip and slot != other:
+            # Work the cost out where it is not known.
+            if search.cost[slot] < 0.0:
+                length = write_row(strips.rows, search, slot, FORWARDS, ground.line, ZERO)
+                search.cost[slot] = row_cost(
+                    ground.line, ZERO, length, ground.boxes, ground.mirror, ground.room
+                )
+            change += search.cost[slot]
     return change
 
 
-@njit(cache=True, nogil=True)
-def append_row(strips, a, c, head_first, top):
-    """Write strip a's row and behind it strip c's, from its head or end, to the top; returns the length."""
-    rows = strips.rows
-    k = top
-    begin = strips.begin[a]
-    for i in range(strips.length[a]):
-        rows[k] = rows[begin + i]
-        k += 1
-    begin = strips.begin[c]
-    length = strips.length[c]
-    if head_first:
-        for i in range(length):
-            rows[k] = rows[begin + i]
-            k += 1
-    else:
-        for i in range(length - 1, -1, -1):
-            rows[k] = rows[begin + i]
-            k += 1
-    return k - top
+@inlined
+def is_end(mate, face):
+    """Whether a face has fewer than two links, and so stands at an end of its row."""
+    free = 0
+    for h in range(3 * face, 3 * face + 3):
+        free += 1 if mate[h] < 0 else 0
+    return free > 1
 
 
-@njit(cache=True, nogil=True)
-def may_merge(strips, ground, w, freed, t, b, rest, most):
+@inlined
+def may_merge(strips, ground, search, used, w, freed, t, b, rest, most):
     """Whether w, an end of strip b of `rest` faces once its link by `freed` is cut, may find a partner."""
+    found = False
     for slot in range(3):
         h = 3 * w + slot
-        if strips.mate[h] >= 0 and h != freed:
-            continue
-        g = ground.ring[h]
-        while g != h:
+        g = h
+        if strips.mate[h] < 0 or h == freed:
+            g = ground.ring[h]
+        while g != h and not found:
             v = g // 3
-            if strips.mate[g] < 0 and v != w and v != t:
-                c = strips.where[v, 0]
-                place = strips.where[v, 1]
-                length = strips.length[c]
-                if (
-                    (place == 0 or place == length - 1)
-                    and (c == b or length + rest <= most)
-                    and (
-                        ground.faces[v, g % 3] != ground.faces[w, slot]
-                        or (ground.flips and may_flip(ground.faces, w, v))
-                    )
-                ):
-                    return True
+            if (
+                strips.mate[g] < 0
+                and v != w
+                and v != t
+                and is_end(strips.mate, v)
+                and may_link(ground.faces, h, g, ground.flips)
+            ):
+                c, _ = locate(strips, search, used, v)
+                s = search.shape[c, 0] if c >= 0 else strips.where[v, 0]
+                length = search.shape[c, 3] if c >= 0 else strips.length[s]
+                found = s == b or length + rest <= most
             g = ground.ring[g]
-    return False
+    return found
 
 
-@njit(cache=True, nogil=True)
-def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowance, most, top):
-    """Look from the end of strip `start` for the best chain of exactly so many rotations, then a merge.
+@inlined
+def list_moves(strips, ground, search, used, d, rotations, neutral, most):
+    """List in moves[d] the rotations that the end at depth d may do, MOST_ROTATIONS at most: how many.
+
+    The last one before a merge is listed only where a merge may follow, unless it may do without (neutral).
+    """
+    path, shape, moves = search.path, search.shape, search.moves
+    rows, mate, ring, faces = strips.rows, strips.mate, ground.ring, ground.faces
+    count = 0
+    a = search.level[d, 2]
+    t = search.level[d, 3]
+    for slot in range(3):
+        h = 3 * t + slot
+        g = ring[h] if mate[h] < 0 else h
+        while g != h:
+            u = g // 3
+            # A half-edge that is linked may be gone through where it is that link that is cut.
+            inner = u != t and (mate[g] >= 0 or not is_end(mate, u)) and may_link(faces, h, g, ground.flips)
+            b = NONE
+            p = ZERO
+            s = ZERO
+            length = ZERO
+            if inner:
+                b, p = locate(strips, search, used, u)
+                s = shape[b, 0] if b >= 0 else np.int64(strips.where[u, 0])
+                length = shape[b, 3] if b >= 0 else strips.length[s]
+                inner = length <= LONGEST
+            # Cut u's link towards the head (side 0) or the end (side 1); see that the lengths are right.
+            for side in range(2 if inner else 0):
+                if a == b:
+                    refused = side == 0 or p + 1 >= length - 1
+                    rest = length
+                elif side == 0:
+                    refused = p == 0 or shape[a, 3] + length - p > most
+                    rest = p
+                else:
+                    refused = p == length - 1 or shape[a, 3] + p + 1 > most
+                    rest = length - 1 - p
+                if refused or count == MOST_ROTATIONS:
+                    continue
+                place = p - 1 + 2 * side
+                w = face_at(rows, search, b, place) if b >= 0 else rows[strips.begin[s] + place]
+                cut = 3 * u
+                while mate[cut] < 0 or mate[cut] // 3 != w:
+                    cut += 1
+                # Never cut a link that this chain has made, nor go where no merge can follow.
+                refused = mate[g] >= 0 and cut != g
+                for i in range(d):
+                    refused = refused or path[i, 0] == cut or path[i, 1] == cut
+                if not refused and d == rotations - 1 and rotations > neutral:
+                    refused = not may_merge(strips, ground, search, used, w, mate[cut], t, s, rest, most)
+                if not refused:
+                    moves[d, count, 0] = h
+                    moves[d, count, 1] = g
+                    moves[d, count, 2] = cut
+                    moves[d, count, 3] = side
+                    moves[d, count, 4] = b
+                    moves[d, count, 5] = s
+                    moves[d, count, 6] = p
+                    moves[d, count, 7] = w
+                    count += 1
+            g = ring[g]
+    return count
+
+
+@inlined
+def keep_best(search, d, h, g):
+    """Write the rotations done so far, and the merge by half-edges h and g behind them, to search.best."""
+    for i in range(d):
+        for k in range(3):
+            search.best[i, k] = search.path[i, k]
+    search.best[d, 0] = h
+    search.best[d, 1] = g
+
+
+@inlined
+def find_tunnel(strips, ground, search, rotations, neutral, price, allowance, most):
+    """Look from the end of virtual row 0 for the best chain of exactly so many rotations, then a merge.
 
     A chain is worth `price` where it ends in a merge, less what it makes the strips dearer, which is at most
     `allowance`; with `neutral` chains without a merge count too. Writes the best chain that is worth more
@@ -313,169 +478,154 @@ def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowa
     Returns:
         Whether there is one, and how much dearer it makes the strips.
     """
-    level, path, saved, touched, best = search
-    rows, begins, lengths, where, mate = (
-        strips.rows, strips.begin, strips.length, strips.where, strips.mate,
-    )  # fmt: skip
-    ring = ground.ring
-    faces = ground.faces
+    level, path, shape, moves = search.level, search.path, search.shape, search.moves
+    rows, mate, ring, faces = strips.rows, strips.mate, ground.ring, ground.faces
     found = False
     found_change = 0.0
     # A change that rounding could explain is worth nothing.
-    best_worth = 1e-6 * strips.kept[start]
+    best_worth = 1e-6 * strips.kept[shape[0, 0]]
     done = 0
-    d = 0
-    touched[0] = start
-    level[0, 0] = start
-    level[0, 1] = 0
-    level[0, 2] = -1
+    used = ONE
+    top = ONE
+    d = ZERO
+    level[0, 2] = 0
+    level[0, 3] = face_at(rows, search, ZERO, shape[0, 3] - 1)
+    arrived = True
     while True:
-        a = level[d, 0]
-        slot = level[d, 1]
-        # Step back where all edges of this end have been tried.
-        if slot == 3:
+        if arrived and d < rotations:
+            level[d, 0] = 0
+            level[d, 1] = list_moves(strips, ground, search, used, d, rotations, neutral, most)
+        elif arrived:
+            # See what the rotations are worth without a merge.
+            a = level[d, 2]
+            t = level[d, 3]
+            if 0 < d <= neutral:
+                change = change_of(strips, ground, search, used, NONE, NONE)
+                if -change > best_worth:
+                    best_worth = -change
+                    found = True
+                    found_change = change
+                    keep_best(search, d, NONE, NONE)
+            # Merge with each strip that ends beside this end, and see what that is worth.
+            for slot in range(3):
+                h = 3 * t + slot
+                g = ring[h] if mate[h] < 0 else h
+                while g != h:
+                    u = g // 3
+                    if mate[g] < 0 and u != t and is_end(mate, u) and may_link(faces, h, g, ground.flips):
+                        b, p = locate(strips, search, used, u)
+                        s = shape[b, 0] if b >= 0 else np.int64(strips.where[u, 0])
+                        length = shape[b, 3] if b >= 0 else strips.length[s]
+                        if a != b and shape[a, 3] + length <= most:
+                            with_b = used
+                            if b < 0:
+                                b = used
+                                with_b = used + 1
+                                take_up(strips, search, b, s, top)
+                            change = change_of(strips, ground, search, with_b, a, b)
+                            if price - change > best_worth and change <= allowance:
+                                k = write_row(rows, search, a, FORWARDS, ground.line, ZERO)
+                                k = write_row(rows, search, b, p > 0, ground.line, k)
+                                change += row_cost(
+                                    ground.line, ZERO, k, ground.boxes, ground.mirror, ground.room
+                                )
+                            if price - change > best_worth and change <= allowance:
+                                best_worth = price - change
+                                found = True
+                                found_change = change
+                                keep_best(search, d, h, g)
+                    g = ring[g]
+        # Step back where all has been tried.
+        if d == rotations or level[d, 0] == level[d, 1] or done == MOST_ROTATIONS:
             if d == 0:
-                return found, found_change
+                break
             d -= 1
-            top = undo(strips, path, saved, d)
-            level[d, 3] += 1
+            top = path[d, 13]
+            used = undo(strips, search, d)
+            arrived = False
             continue
-        # Find the next half-edge to go through.
-        t = rows[begins[a] + lengths[a] - 1]
-        h = 3 * t + slot
-        g = level[d, 2]
-        if g < 0:
-            if mate[h] >= 0:
-                level[d, 1] += 1
-                continue
-            g = ring[h]
-            level[d, 2] = g
-            level[d, 3] = 0
-        if g == h:
-            level[d, 1] += 1
-            level[d, 2] = -1
-            continue
-        side = level[d, 3]
-        u = g // 3
-        if (
-            side > 1
-            or u == t
-            or (faces[u, g % 3] == faces[t, slot] and not (ground.flips and may_flip(faces, t, u)))
-        ):
-            level[d, 2] = ring[g]
-            level[d, 3] = 0
-            continue
-        b = where[u, 0]
-        p = where[u, 1]
-        length = lengths[b]
-        if mate[g] < 0 and (p == 0 or p == length - 1):
-            # Merge with the strip that ends here, and see what that is worth.
-            level[d, 3] = 2
-            if d == rotations and a != b and lengths[a] + length <= most:
-                touched[d + 1] = b
-                change = change_of(strips, ground, touched, d + 2, a, b)
-                if price - change > best_worth and change <= allowance:
-                    total = append_row(strips, a, b, p == 0, top)
-                    change += row_cost(rows, top, total, ground.boxes, ground.mirror, ground.room)
-                    if price - change > best_worth and change <= allowance:
-                        best_worth = price - change
-                        found = True
-                        found_change = change
-                        for i in range(d):
-                            for k in range(3):
-                                best[i, k] = path[i, k]
-                        best[d, 0] = h
-                        best[d, 1] = g
-            continue
-        if d == rotations or length > LONGEST:
-            level[d, 3] = 2
-            continue
-        # Cut u's link towards the head (side 0) or towards the end (side 1); see that the lengths are right.
-        if a == b:
-            refused = side == 0 or p + 1 >= length - 1
-            rest = length
-        elif side == 0:
-            refused = p == 0 or lengths[a] + length - p > most
-            rest = p
-        else:
-            refused = p == length - 1 or lengths[a] + p + 1 > most
-            rest = length - 1 - p
-        if refused or done >= MOST_ROTATIONS:
-            level[d, 3] += 1
-            continue
-        w = rows[begins[b] + p - 1 + 2 * side]
-        cut = 3 * u
-        while mate[cut] < 0 or mate[cut] // 3 != w:
-            cut += 1
-        # Go through a half-edge that is linked only where it is that link that is cut.
-        refused = mate[g] >= 0 and cut != g
-        # Never cut a link that this chain has made, nor go where no merge can follow.
-        for i in range(d):
-            refused = refused or path[i, 0] == cut or path[i, 1] == cut
-        if not refused and d == rotations - 1 and rotations > neutral:
-            refused = not may_merge(strips, ground, w, mate[cut], t, b, rest, most)
-        if refused:
-            level[d, 3] += 1
-            continue
-        top = rotate(strips, path, saved, d, a, h, g, cut, top)
+        # Do the next rotation.
+        k = level[d, 0]
+        level[d, 0] = k + 1
+        b = moves[d, k, 4]
+        path[d, 13] = top
+        before = used
+        if b < 0:
+            b = used
+            used += 1
+            top = take_up(strips, search, b, moves[d, k, 5], top)
+        h, g, cut, side, p = moves[d, k, 0], moves[d, k, 1], moves[d, k, 2], moves[d, k, 3], moves[d, k, 6]
+        top = rotate(strips, search, d, before, level[d, 2], b, p, side, h, g, cut, top)
         done += 1
         d += 1
-        touched[d] = b
-        level[d, 0] = b
-        level[d, 1] = 0
-        level[d, 2] = -1
-        # See what the rotations are worth without a merge.
-        if d == rotations and rotations <= neutral:
-            change = change_of(strips, ground, touched, d + 1, -1, -1)
-            if -change > best_worth:
-                best_worth = -change
-                found = True
-                found_change = change
-                for i in range(d):
-                    for k in range(3):
-                        best[i, k] = path[i, k]
-                best[d, 0] = -1
+        level[d, 2] = b
+        level[d, 3] = moves[d - 1, k, 7]
+        arrived = True
+    return found, found_change
 
 
-@njit(cache=True, nogil=True)
-def accept(strips, ground, search, start, rotations, now, top):
-    """Do the best chain that find_tunnel left, for good; returns the new top."""
-    touched = search.touched
-    best = search.best
-    a = start
-    touched[0] = a
-    count = 1
+@inlined
+def accept(strips, ground, search, rotations, now, top):
+    """Do the best chain that find_tunnel left, for good; returns the new top of the arena."""
+    best, shape = search.best, search.shape
+    rows = strips.rows
+    used = ONE
+    a = ZERO
+    end = ONE
     for d in range(rotations):
-        b = strips.where[best[d, 1] // 3, 0]
-        top = rotate(strips, search.path, search.saved, d, a, best[d, 0], best[d, 1], best[d, 2], top)
+        u = best[d, 1] // 3
+        b, p = locate(strips, search, used, u)
+        with_b = used
+        if b < 0:
+            b = used
+            with_b = used + 1
+            end = take_up(strips, search, used, np.int64(strips.where[u, 0]), end)
+        cut = best[d, 2]
+        _, q = locate(strips, search, with_b, strips.mate[cut] // 3)
+        side = ZERO if q < p else ONE
+        end = rotate(strips, search, d, used, a, b, p, side, best[d, 0], best[d, 1], cut, end)
+        used = with_b
         a = b
-        touched[count] = b
-        count += 1
     # Append the other strip to the last end's.
-    if best[rotations, 0] >= 0:
-        h = best[rotations, 0]
+    gone = NONE
+    p = ZERO
+    h = best[rotations, 0]
+    if h >= 0:
         g = best[rotations, 1]
-        c = strips.where[g // 3, 0]
-        length = append_row(strips, a, c, strips.where[g // 3, 1] == 0, top)
+        gone, p = locate(strips, search, used, g // 3)
+        if gone < 0:
+            gone = used
+            end = take_up(strips, search, used, np.int64(strips.where[g // 3, 0]), end)
+            used += 1
         strips.mate[h] = g
         strips.mate[g] = h
-        strips.length[c] = 0
-        strips.kept[c] = 0.0
-        strips.begin[a] = top
-        relabel(strips.rows, top, strips.length[a], length, a, strips.where)
-        strips.length[a] = length
-        strips.cost[a] = -1.0
-        top += length
-    # Keep the costs.
-    for i in range(count):
-        s = touched[i]
-        if strips.length[s] > 0:
-            strips.kept[s] = known_cost(strips, ground, s)
-            strips.changed[s] = now
+        search.cost[a] = -1.0
+    # Write the rows to the arena, and keep their costs.
+    for slot in range(used):
+        if slot != gone:
+            k = write_row(rows, search, slot, FORWARDS, rows, top)
+            if slot == a and gone >= 0:
+                k = write_row(rows, search, gone, p > 0, rows, k)
+            shape[slot, 1] = top
+            shape[slot, 3] = k - top
+            top = k
+    for slot in range(used):
+        s = shape[slot, 0]
+        if slot == gone:
+            strips.length[s] = 0
+            strips.kept[s] = 0.0
+            continue
+        begin = shape[slot, 1]
+        length = shape[slot, 3]
+        strips.begin[s] = begin
+        strips.length[s] = length
+        relabel(rows, begin, 0, length, s, strips.where)
+        strips.kept[s] = row_cost(rows, begin, length, ground.boxes, ground.mirror, ground.room)
+        strips.changed[s] = now
     return top
 
 
-@njit(cache=True, nogil=True)
+@helper
 def compact(strips, spare):
     """Move the rows of the strips that are left to the arena's bottom, in order; returns the top."""
     k = 0
@@ -485,14 +635,19 @@ def compact(strips, spare):
         for i in range(strips.length[s]):
             spare[k] = strips.rows[begin + i]
             k += 1
-    strips.rows[:k] = spare[:k]
+    for i in range(k):
+        strips.rows[i] = spare[i]
     return k
 
 
-@njit(cache=True, nogil=True)
-def by_length(length, order, longest):
-    """List the strips of up to `longest` faces in `order`, the shortest first, equals by number."""
-    first = np.zeros(longest + 2, np.int32)
+@helper
+def by_length(length, order, longest, first):
+    """List the strips of up to `longest` faces in `order`, the shortest first, equals by number.
+
+    Returns how many there are; first (longest + 2,) is room.
+    """
+    for k in range(longest + 2):
+        first[k] = 0
     for s in range(length.shape[0]):
         if 0 < length[s] <= longest:
             first[length[s] + 1] += 1
@@ -505,7 +660,7 @@ def by_length(length, order, longest):
     return first[longest]
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def changed_near(strips, ring, s, since):
     """Whether strip s, or one that its ends might go into, has been changed after a time."""
     if strips.changed[s] > since:
@@ -522,13 +677,14 @@ def changed_near(strips, ring, s, since):
     return False
 
 
-@njit(cache=True, nogil=True)
-def search_range(strips, ground, most, deepest, neutral, price_share, rise, passes, leaves):
+@maker
+def search_range(strips, ground, search, most, deepest, neutral, price_share, rise, passes, leaves):
     """Improve the strips of a range in passes over them, the shortest first, from both ends.
 
     Args:
         strips: Their rows at the arena's bottom; cost, kept and changed are set here.
         ground: The range.
+        search: Room, as `room_for_search` makes it.
         most: The most faces of a strip.
         deepest: The most rotations of a chain.
         neutral: The most rotations of a chain without a merge.
@@ -543,25 +699,22 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
     count = strips.begin.shape[0]
     faces = ground.faces.shape[0]
     longest = min(most, LONGEST)
-    search = Search(
-        np.empty((deepest + 2, 4), np.int32),
-        np.empty((deepest + 2, 10), np.int32),
-        np.empty((deepest + 2, 2), np.float64),
-        np.empty(deepest + 3, np.int32),
-        np.empty((deepest + 2, 3), np.int32),
-    )
-    spare = np.empty(faces, np.int32)
-    order = np.empty(count, np.int32)
-    tried = np.full(count, -1, np.int32)
     # Cost the strips as they are.
-    strips.cost[:] = -1.0
-    strips.changed[:] = 0
     start_cost = leaves
     searched = 0
     for s in range(count):
         strips.kept[s] = 0.0
+        strips.changed[s] = 0
+        search.tried[s] = -1
         if strips.length[s] <= LONGEST:
-            strips.kept[s] = known_cost(strips, ground, s)
+            strips.kept[s] = row_cost(
+                strips.rows,
+                np.int64(strips.begin[s]),
+                np.int64(strips.length[s]),
+                ground.boxes,
+                ground.mirror,
+                ground.room,
+            )
             start_cost += strips.kept[s]
             searched += 1
     if searched == 0:
@@ -569,44 +722,36 @@ def search_range(strips, ground, most, deepest, neutral, price_share, rise, pass
     price = price_share * (start_cost - leaves) / searched
     cost = start_cost
     most_cost = start_cost * (1.0 + rise)
-    top = faces
+    top = np.int64(faces)
     room = (2 * deepest + 4) * LONGEST
-    now = 0
+    now = ZERO
     for _ in range(passes):
         accepted = 0
-        waiting = by_length(strips.length, order, longest)
+        waiting = by_length(strips.length, search.order, longest, search.first)
         for k in range(waiting):
-            s = order[k]
-            if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, tried[s]):
+            s = np.int64(search.order[k])
+            if strips.length[s] == 0 or not changed_near(strips, ground.ring, s, search.tried[s]):
                 continue
-            tried[s] = now
+            search.tried[s] = now
             for side in range(2):
                 if strips.length[s] == 0 or (side == 1 and strips.length[s] == 1):
                     break
                 if top + room > strips.rows.shape[0]:
-                    top = compact(strips, spare)
-                # Turn the head to the back, so that the search goes out from it.
-                begin = strips.begin[s]
-                before = top
-                if side == 0:
-                    top = reverse(strips, s, top)
-                    strips.cost[s] = -1.0
-                found = False
+                    top = compact(strips, search.spare)
                 for rotations in range(deepest + 1):
+                    # Go out from the end, or turned round from the head.
+                    take_up(strips, search, ZERO, s, ZERO)
+                    if side == 0:
+                        turn_pieces(search.pieces, ZERO, ONE)
                     found, change = find_tunnel(
-                        strips, ground, search, s, rotations, neutral, price, most_cost - cost, longest, top
+                        strips, ground, search, rotations, neutral, price, most_cost - cost, longest
                     )
                     if found:
                         now += 1
-                        top = accept(strips, ground, search, s, rotations, now, top)
+                        top = accept(strips, ground, search, rotations, now, top)
                         cost += change
                         accepted += 1
                         break
-                if not found and side == 0:
-                    top = before
-                    strips.begin[s] = begin
-                    strips.cost[s] = strips.kept[s]
-                    relabel(strips.rows, begin, 0, strips.length[s], s, strips.where)
         if accepted == 0:
             break
     return start_cost, cost

@@ -1,7 +1,8 @@
 """Equal rows and near points by hashing: linear, and the first row always stands for the others."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, kernel
 
 LOW_WORD = np.uint64(0xFFFFFFFF)
 NEAR_PROBES = 6
@@ -11,7 +12,7 @@ SMALLEST_CELL = 1e-44
 """In the unit of the points: a finer grid than float32 would overflow and tell nothing more apart."""
 
 
-@njit(cache=True, nogil=True)
+@helper
 def scramble(word):
     """A 32-bit permutation that spreads every bit (Wellons 2018, "Prospecting for hash functions").
 
@@ -23,13 +24,13 @@ def scramble(word):
     return word ^ (word >> np.uint64(16))
 
 
-@njit(cache=True, nogil=True)
+@helper
 def mix_bits(a, b, c):
     """A 32-bit hash of three 32-bit words."""
     return scramble(np.uint64(c) ^ scramble(np.uint64(b) ^ scramble(np.uint64(a))))
 
 
-@njit(cache=True, nogil=True)
+@helper
 def table_size(rows):
     """A power of two of at least twice so many rows."""
     slots = 16
@@ -38,13 +39,13 @@ def table_size(rows):
     return slots
 
 
-@njit(cache=True, nogil=True)
+@helper
 def part_of(mixed, parts):
     """Which of `parts` a hash belongs to, by its high bits: the low ones choose the slot."""
     return np.int64(mixed >> np.uint64(16)) * parts >> 16
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_equal_rows(words, part, parts, first):
     """Note the first equal row of each row of `words`, `(n, 3)` uint32, of one part by hash.
 
@@ -91,7 +92,7 @@ def first_equal_rows(words, part, parts, first):
     return repeats
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def least_first(faces, face):
     """The corners of a face, turned so that the least comes first."""
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -102,7 +103,7 @@ def least_first(faces, face):
     return a, b, c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated):
     """Mark the kept faces that repeat an earlier kept one up to rotation, of one part by least vertex.
 
@@ -150,7 +151,7 @@ def mark_repeated_faces(faces, keep, vertex_count, part, parts, repeated):
             repeated[face] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_used(faces, begin, end, used):
     """Mark the vertices of the faces `begin:end`; threads that mark the same vertex write the same."""
     for face in range(begin, end):
@@ -158,7 +159,7 @@ def mark_used(faces, begin, end, used):
             used[faces[face, corner]] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def renumber_faces(faces, place, begin, end):
     """Put the vertices of the faces `begin:end` in their new places."""
     for face in range(begin, end):
@@ -166,14 +167,14 @@ def renumber_faces(faces, place, begin, end):
             faces[face, corner] = place[faces[face, corner]]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def bits_of_whole_number(x):
     """A word that tells whole float64 numbers apart where they fit 32 bits, and is any word elsewhere."""
     folded = x - 4294967296.0 * np.floor(x / 4294967296.0)
     return np.uint32(np.uint64(folded))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def nearest_leaders(points, distance):
     """Join each point to the nearest earlier leader within `distance`, or make it a leader.
 

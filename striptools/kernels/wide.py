@@ -1,7 +1,8 @@
 """Kernels of the collapse of a binary hierarchy to eight-wide nodes, and of the tracer's leaf blocks."""
 
 import numpy as np
-from numba import njit
+
+from striptools.kernels.compiled import helper, inlined, kernel
 
 WIDTH = 8
 """Children of a wide node and triangles of a leaf block: the float32 lanes of one AVX register."""
@@ -12,7 +13,7 @@ EMPTY = np.int32(-(2**31))
 """The child of an empty lane."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def half_area(boxes, p):
     """Half the surface area of one box, in float64: finite for all finite boxes."""
     dx = np.float64(boxes[p, 3]) - boxes[p, 0]
@@ -21,7 +22,7 @@ def half_area(boxes, p):
     return dx * dy + dy * dz + dz * dx
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
     """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
 
@@ -87,7 +88,7 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
     return split, as_leaf, cost[0, 1]
 
 
-@njit(cache=True, nogil=True)
+@helper
 def gather_children(p, size, split, nodes, budget, children):
     """Write the binary nodes that become the children of the wide node at p, in order; return how many."""
     nodes[0] = p + 2 * size[p + 1]
@@ -115,7 +116,7 @@ def gather_children(p, size, split, nodes, budget, children):
     return found
 
 
-@njit(cache=True, nogil=True)
+@helper
 def assign_lanes(boxes, p, children, found, lane_of):
     """Give each child of p a lane, whose bits say on which side of p's centre it lies; best fits first."""
     taken = 0
@@ -146,7 +147,7 @@ def assign_lanes(boxes, p, children, found, lane_of):
         taken |= 1 << best_lane
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def emit_wide(boxes, size, split, as_leaf):
     """Lay out the wide nodes that `cheapest_forests` chose.
 
@@ -228,20 +229,20 @@ def emit_wide(boxes, size, split, as_leaf):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def flushed(value):
     """Zero for a denormal float32, as XLA has it."""
     return value if abs(value) >= LEAST_NORMAL else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def scaled(value, scale):
     """A float32 times a power of two as the walks have it: zero where that is no normal number."""
     exact = np.float64(value) * np.float64(scale)
     return np.float32(exact) if abs(exact) >= np.float64(LEAST_NORMAL) else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def comes_before(corners, a, b):
     """Whether corner a of a triangle is smaller than corner b by x, then y, then z."""
     for axis in range(3):
@@ -250,7 +251,7 @@ def comes_before(corners, a, b):
     return False
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def first_corner(corners):
     """The corner that comes first in the one order that all tests use: the smallest, the first of equals."""
     turn = 0
@@ -260,7 +261,7 @@ def first_corner(corners):
     return turn
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_leaf_blocks(
     positions, faces, ids, rotations, scale, leaf_first, leaf_count, blocks, block_bits, place
 ):
@@ -297,7 +298,7 @@ def fill_leaf_blocks(
             place[ids[t]] = (q * WIDTH + lane) * 4 + (turn + rotations[t]) % 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weigh_corners(origins, directions, r, scale, corners, turn, weights):
     """Where on its face a hit lies: the watertight test's own edge functions, once, for the face hit.
 
@@ -345,7 +346,7 @@ def weigh_corners(origins, directions, r, scale, corners, turn, weights):
     weights[(turn + 2) % 3] = c * inverse
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
 ):

@@ -120,7 +120,7 @@ class StudyRow:
         variant: Its name.
         method: The method of its ordering.
         max_length: The longest strip it was allowed; None for any length.
-        scene_bytes: Bytes of the scene that tracing needs: every part but the remap.
+        scene_bytes: Bytes of the scene that tracing needs: every part but the remap and attributes.
         swap_bytes: The same with the paper's swap vertices, a byte each, in place of turn bits.
         order_seconds: Seconds of the stage that made the strips.
         primary_rate: Primary rays a second, in the fastest run.
@@ -250,9 +250,9 @@ def _short_strips(
 
 
 def _bytes(scene: Scene) -> int:
-    """What tracing needs of a scene: every part but the remap."""
+    """What tracing needs of a scene: every part but the remap and attributes."""
     parts = scene.part_bytes()
-    return sum(parts.values()) - parts["remap"]
+    return sum(parts.values()) - parts["remap"] - parts["attributes"]
 
 
 def _rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[_Rays, _Rays]:

@@ -70,6 +70,11 @@ class Attribute:
             raise UsageError("groups are numbers from 0 on, one a face", where="attributes")
         object.__setattr__(self, "values", values)
 
+    @property
+    def plural(self) -> str:
+        """What its values are called in words for people."""
+        return "groups and materials" if self.name == "group" else f"{self.name}s"
+
     def at_corners(self, faces: Faces) -> np.ndarray:
         """`(3 f, k)`: the value at each corner of the mesh's faces."""
         if self.domain == "vertex":

@@ -112,8 +112,7 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
 
 def unkept(mesh: Mesh, file_format: str) -> tuple[str, ...]:
     """What `save_mesh` leaves out of a file of a format, in words for people; empty where it is nothing."""
-    what = [one.name for one in mesh.attributes if not _is_kept(one, file_format)]
-    words = [{"group": "groups and materials"}.get(name, f"{name}s") for name in what]
+    words = [one.plural for one in mesh.attributes if not _is_kept(one, file_format)]
     if mesh.instances is not None and file_format != "glb":
         words.insert(0, "instances, each written in full")
     if file_format == "glb" and any(one.group for one in mesh.materials):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from striptools.errors import LimitError, UsageError
-from striptools.mesh.attributes import Attribute, Material, check_attributes
+from striptools.mesh.attributes import NAMES, Attribute, Material, check_attributes
 from striptools.mesh.instances import (
     Geometries,
     Instances,
@@ -36,7 +36,8 @@ class Mesh:
             NaN and infinities too (`striptools.mesh.clean` drops what cannot be used).
         faces: `(f, 3)` int32, each row three vertex indices in winding order.
         notes: What loading did to arrive here, one short phrase each ("12 n-gons triangulated").
-        attributes: What else the source says of vertices, corners and faces, at most one of a name.
+        attributes: What else the source says of vertices, corners and faces, at most one of a name; kept in
+            the order of `NAMES`.
         materials: What the numbers of the attribute `group` stand for.
         unit: The length that 1 stands for ("m", "mm", "in"), where the source says so.
         geometries: Which faces and vertices are one geometry, where geometries stand in several places; None
@@ -74,7 +75,8 @@ class Mesh:
         object.__setattr__(self, "positions", np.ascontiguousarray(positions))
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, np.int32))
         object.__setattr__(self, "notes", tuple(self.notes))
-        object.__setattr__(self, "attributes", tuple(self.attributes))
+        attributes = sorted(self.attributes, key=lambda one: NAMES.index(one.name))
+        object.__setattr__(self, "attributes", tuple(attributes))
         object.__setattr__(self, "materials", tuple(self.materials))
         check_attributes(self.attributes, self.materials, len(positions), len(faces))
         check_instances(self.geometries, self.instances, len(positions), self.faces)
@@ -82,6 +84,13 @@ class Mesh:
     def attribute(self, name: str) -> Attribute | None:
         """The attribute of a name, or None."""
         return next((one for one in self.attributes if one.name == name), None)
+
+    def geometry(self) -> Mesh:
+        """The mesh without attributes and materials, and a note on what was left out."""
+        if not self.attributes:
+            return replace(self, materials=())
+        note = f"left out: {', '.join(one.plural for one in self.attributes)}"
+        return replace(self, notes=(*self.notes, note), attributes=(), materials=())
 
     @property
     def triangle_count(self) -> int:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from striptools.kernels import boxes as kernels
+from striptools.kernels.hierarchy import boxes_from_below
 from striptools.threads import in_chunks
 from striptools.types import Boxes, Counts, FaceIds, Faces, Positions
 
@@ -37,6 +38,4 @@ def range_boxes(boxes: Boxes, starts: Counts, items: FaceIds | None = None) -> B
 
 def node_boxes(tree: "ObjectTree", item_boxes: Boxes) -> Boxes:
     """The exact box of every node of an object tree, (2n-1, 6) float32, in its preorder numbering."""
-    boxes = np.zeros((len(tree.size), 6), np.float32)
-    kernels.node_boxes(tree.order, tree.size, np.ascontiguousarray(item_boxes), boxes)
-    return boxes
+    return boxes_from_below(tree.size, np.ascontiguousarray(item_boxes[tree.order]))

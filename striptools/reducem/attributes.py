@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -207,6 +207,17 @@ def encode_materials(materials: Sequence[Material]) -> bytes:
     if len(data) > layout.MATERIALS_LIMIT or len(rows) > MOST_MATERIALS:
         raise LimitError(f"{len(rows)} materials are too many", remedy="leave out all but the geometry")
     return data
+
+
+def fitting(mesh: Mesh) -> Mesh:
+    """The mesh without its groups, and with a note, where their materials are more than a scene can hold."""
+    try:
+        encode_materials(mesh.materials)
+    except LimitError as error:
+        kept = tuple(one for one in mesh.attributes if one.name != "group")
+        note = f"groups left out: {error.what}"
+        return replace(mesh, notes=(*mesh.notes, note), attributes=kept, materials=())
+    return mesh
 
 
 def check_materials(rows: Any, where: str) -> tuple[Material, ...]:

@@ -79,11 +79,13 @@ _ALL = (
     _flaw("RDM117", "4", "a section is there that the scene does not need"),
     _flaw("RDM118", "3.2", "a raw section has two lengths or two checksums"),
     _flaw("RDM119", "6", "the codec of a section is not known", _UPDATE),
-    _flaw("RDM120", "6", "the scene record, or the instances, are not raw"),
+    _flaw("RDM120", "6", "the scene record is not raw"),
     _flaw("RDM121", "6", "the stored bytes of a section do not decode to its raw length", _DAMAGED),
     _flaw("RDM122", "3.2", "the checksum of a section's decoded bytes does not fit", _DAMAGED),
     _word("RDM123", "6", "a section is passed over: its codec is not installed", "install the extra archive"),
     _flaw("RDM124", "8", "the scene is larger than this program can hold", "split the model"),
+    _flaw("RDM125", "6", "the codec of a section is not one for its kind"),
+    _flaw("RDM126", "6.2", "the streams of packed block data do not fit the block headers", _DAMAGED),
     _flaw("RDM201", "4.1", "a count is out of its range, or disagrees with another one"),
     _flaw("RDM202", "4.1", "the error bound is negative or not finite"),
     _flaw("RDM203", "4.1", "the grid exponent is out of its range, or there without a grid"),
@@ -106,7 +108,7 @@ _ALL = (
     _flaw("RDM527", "4.7", "an unused bit of the attributes is set"),
     _flaw("RDM528", "4.7", "a group has no material"),
     _flaw("RDM531", "4.8", "the materials are no JSON array of materials in UTF-8"),
-    _flaw("RDM532", "4.8", "the materials are longer than 2^24 bytes"),
+    _flaw("RDM532", "4.8", "the materials are longer than 2^22 bytes"),
     _flaw(
         "RDM541", "4.10", "the blocks or top nodes of a geometry are none, too many, or out of their order"
     ),

@@ -15,6 +15,8 @@ MUST_UNDERSTAND = 1
 
 CODEC_RAW = 0
 CODEC_ZSTD = 1
+CODEC_BLOCKS = 2
+CODEC_PLANES = 3
 LARGEST_WINDOW = 27
 """Two to this many bytes is the largest window of a Zstandard frame."""
 
@@ -47,7 +49,7 @@ GRID_EXPONENTS = range(-149, 105)
 CELL_EXPONENTS = range(-149, 128)
 INSTANCE_LIMIT = 2**24
 METADATA_LIMIT = 2**20
-MATERIALS_LIMIT = 2**24
+MATERIALS_LIMIT = 2**22
 ATTRIBUTES_HEAD = 8
 """Bytes before the records of the attributes: how many there are, and a reserved word."""
 
@@ -226,6 +228,19 @@ SECTIONS = (
 
 RAW = (SCENE, INSTANCES)
 """Those that must not be packed: what bounds the length of others, and what no count bounds."""
+
+PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 2, REMAP.kind: 4}
+"""Bytes of a record for the kinds of sections that may have the codec of planes."""
+
+
+def codecs_of(section: Section) -> tuple[int, ...]:
+    """The codecs that a section may have."""
+    if section in RAW:
+        return (CODEC_RAW,)
+    if section is BLOCK_DATA:
+        return (CODEC_RAW, CODEC_ZSTD, CODEC_BLOCKS)
+    return (CODEC_RAW, CODEC_ZSTD) + ((CODEC_PLANES,) if section.kind in PLANE_WIDTHS else ())
+
 
 PARTS = (
     "positions",

@@ -24,7 +24,7 @@ import numpy as np
 from striptools.hierarchies.packed import BoxGrid, PackedNodes
 from striptools.mesh.attributes import Domain, Material
 from striptools.reducem import check, layout
-from striptools.reducem.archive import expanded
+from striptools.reducem.archive import expanded, expanded_blocks
 from striptools.reducem.attributes import Column, check_columns, check_materials, decode_columns
 from striptools.reducem.blocks import Blocks, check_headers
 from striptools.reducem.geometries import (
@@ -231,7 +231,11 @@ class _File:
         payload = self.stored(entry)
         if entry.codec == layout.CODEC_RAW:
             return np.frombuffer(payload, np.uint8)
-        raw = expanded(payload, entry.raw_length, place)
+        if entry.codec == layout.CODEC_BLOCKS:
+            given = (self.headers(), self.record["triangle_count"], entry.raw_length, self.where)
+            raw = expanded_blocks(payload, *given).astype("<u4", copy=False).view(np.uint8)
+        else:
+            raw = expanded(payload, entry.codec, entry.kind, entry.raw_length, place)
         if zlib.crc32(raw.data) != entry.raw_checksum:
             raise unreadable("RDM122", place)
         return raw
@@ -267,15 +271,19 @@ class _File:
         }
         return fields[name]
 
+    def headers(self) -> np.ndarray:
+        """The headers of blocks as they are stored, (b, 8) uint32."""
+        raw = self.section(layout.BLOCK_HEADERS, layout.BLOCK_HEADER.size * self.record["block_count"])
+        return _array(raw, "<u4", np.uint32).reshape(-1, 8)
+
     def blocks(self) -> Blocks:
         """The blocks, their headers checked."""
-        count = self.record["block_count"]
-        headers = self.section(layout.BLOCK_HEADERS, layout.BLOCK_HEADER.size * count)
+        count, headers = self.record["block_count"], self.headers()
         most = layout.MOST_BLOCK_BYTES * count + layout.MOST_BEHIND_BLOCKS if count else 0
         words = self.section(layout.BLOCK_DATA, layout.ALIGNMENT if count else 0, most)
         if len(words) % 4:
             raise unreadable("RDM606", f"{self.where}: BLKD")
-        blocks = Blocks(_array(headers, "<u4", np.uint32).reshape(-1, 8), _array(words, "<u4", np.uint32))
+        blocks = Blocks(headers, _array(words, "<u4", np.uint32))
         if count:
             check_headers(blocks, self.record["triangle_count"], self.where)
         return blocks
@@ -445,10 +453,10 @@ def _check_entry(entry: _Entry) -> None:
     stored = (entry.stored_length, entry.stored_checksum)
     if entry.codec == layout.CODEC_RAW and stored != (entry.raw_length, entry.raw_checksum):
         raise unreadable("RDM118", entry.place)
-    if section is not None and entry.codec not in (layout.CODEC_RAW, layout.CODEC_ZSTD):
+    if section is not None and entry.codec > layout.CODEC_PLANES:
         raise unreadable("RDM119", entry.place)
-    if section in layout.RAW and entry.codec != layout.CODEC_RAW:
-        raise unreadable("RDM120", entry.place)
+    if section is not None and entry.codec not in layout.codecs_of(section):
+        raise unreadable("RDM120" if section is layout.SCENE else "RDM125", entry.place)
 
 
 _TOO_LONG = {layout.METADATA.kind: "RDM902", layout.MATERIALS.kind: "RDM532"}
@@ -496,11 +504,10 @@ def _array(payload: np.ndarray, stored: str, native: type) -> np.ndarray:
 
 def _levels(text: str) -> int:
     """How deep arrays and objects are nested; brackets in strings do not count."""
-    depth = deepest = 0
-    for token in re.finditer(r'"(?:[^"\\]|\\.)*"?|[\[{]|[\]}]', text, re.DOTALL):
-        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token[0], 0)
-        deepest = max(deepest, depth)
-    return deepest
+    bare = np.frombuffer(re.sub(r'"(?:[^"\\]|\\.)*"?', "", text, flags=re.DOTALL).encode(), np.uint8)
+    opening = (bare == ord("[")) | (bare == ord("{"))
+    closing = (bare == ord("]")) | (bare == ord("}"))
+    return int(np.cumsum(opening.astype(np.int32) - closing).max(initial=0))
 
 
 def _integer(digits: str) -> int | str:

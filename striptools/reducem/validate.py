@@ -17,8 +17,9 @@ import numpy as np
 
 from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.issues import ISSUES, Finding
+from striptools.reducem.validate_archive import content_limit, join_blocks, join_planes
 from striptools.reducem.validate_attributes import inspect_attributes, inspect_materials
-from striptools.reducem.validate_blocks import inspect_blocks
+from striptools.reducem.validate_blocks import Blocks, inspect_blocks, inspect_headers
 from striptools.reducem.validate_instances import inspect_geometries, inspect_instances, inspect_owners
 from striptools.reducem.validate_nodes import inspect_nodes
 from striptools.reducem.validate_packed import unpack
@@ -29,9 +30,10 @@ _NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
 _PASSED_OVER = ("RMAP", "ATTR", "MATL", "META")
 _KNOWN = (*_NEEDED, *_PASSED_OVER)
 _OPTIONAL = (*_PASSED_OVER, "GEOM", "INST")
-_RAW = ("SCEN", "INST")
+_WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 2, "RMAP": 4}
+"""Bytes of a record for the kinds that may have codec 3."""
 _MOST_METADATA = 2**20
-_MOST_MATERIALS = 2**24
+_MOST_MATERIALS = 2**22
 _TOO_LONG = {"META": "RDM902", "MATL": "RDM532"}
 _MOST_LEVELS = 32
 
@@ -160,12 +162,23 @@ def _entry(inspection: Inspection, entry: _Entry) -> None:
     raw = (entry.stored_length, entry.stored_checksum)
     if entry.codec == 0 and raw != (entry.raw_length, entry.raw_checksum):
         inspection.found("RDM118", entry.place, entry.at + 24)
-    if entry.kind in _KNOWN and entry.codec > 1:
+    if entry.kind in _KNOWN and entry.codec > 3:
         inspection.found("RDM119", entry.place, entry.at + 6)
-    if entry.kind in _RAW and entry.codec != 0:
+    elif entry.kind == "SCEN" and entry.codec != 0:
         inspection.found("RDM120", entry.place, entry.at + 6)
+    elif not _codec_fits(entry):
+        inspection.found("RDM125", entry.place, entry.at + 6)
     if zlib.crc32(inspection.data[entry.offset : entry.end]) != entry.stored_checksum:
         inspection.found("RDM110", entry.place, entry.at + 32)
+
+
+def _codec_fits(entry: _Entry) -> bool:
+    """Whether the codec is one that the kind may have; a kind that is not known may have any."""
+    if entry.kind not in _KNOWN or entry.codec == 0:
+        return True
+    if entry.codec == 1:
+        return entry.kind != "INST"
+    return entry.kind == "BLKD" if entry.codec == 2 else entry.kind in _WIDTHS
 
 
 def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
@@ -186,7 +199,8 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
         inspection.found("RDM114", "SCEN", entry.at + 16)
         return False
     lengths = _lengths(*struct.unpack_from("<5I", payload), payload[24] & 1)
-    for kind, entry in first.items():
+    # Block data may lean on the headers, wherever those lie.
+    for kind, entry in sorted(first.items(), key=lambda item: item[1].codec == 2):
         _decode(inspection, entry, lengths[kind])
     for kind, (least, _) in lengths.items():
         if least and kind not in first and kind not in _OPTIONAL:
@@ -213,18 +227,53 @@ def _decode(inspection: Inspection, entry: _Entry, lengths: tuple[int, int]) -> 
     if not lengths[0] <= entry.raw_length <= lengths[1]:
         return inspection.found(_TOO_LONG.get(entry.kind, "RDM114"), entry.place, entry.at + 24)
     payload = inspection.data[entry.offset : entry.end]
-    if entry.kind in _RAW and entry.codec != 0:
-        return None
-    if entry.codec == 1:
-        code, payload = unpack(payload, entry.raw_length)
-        if code:
-            return inspection.found(code, entry.place, entry.offset)
+    if entry.codec:
+        payload = _expanded(inspection, entry, payload)
+        if payload is None:
+            return None
         if zlib.crc32(payload) != entry.raw_checksum:
             inspection.found("RDM122", entry.place, entry.at + 36)
-    if entry.codec <= 1 and len(payload) == entry.raw_length:
+    if len(payload) == entry.raw_length:
         inspection.undecoded.remove(entry.kind)
         inspection.sections[entry.kind] = Section(entry.kind, entry.offset, entry.codec, payload)
     return None
+
+
+def _expanded(inspection: Inspection, entry: _Entry, stored: bytes) -> bytes | None:
+    """The decoded bytes of a section that is not raw, or None where that is found to be impossible."""
+    if entry.codec > 3 or not _codec_fits(entry):
+        return None
+    limits, blocks = (entry.raw_length, entry.raw_length), None
+    if entry.codec == 2:
+        blocks = _sound_headers(inspection, entry)
+        if blocks is None:
+            return None
+        limits = (1, content_limit(blocks))
+    code, payload = unpack(stored, *limits)
+    if code:
+        inspection.found(code, entry.place, entry.offset)
+        return None
+    if blocks is not None:
+        payload = join_blocks(payload, blocks, entry.raw_length)
+        if payload is None:
+            inspection.found("RDM126", entry.place, entry.offset)
+        return payload
+    return join_planes(payload, _WIDTHS[entry.kind]) if entry.codec == 3 else payload
+
+
+def _sound_headers(inspection: Inspection, entry: _Entry) -> Blocks | None:
+    """The headers of blocks, where they keep every rule with block data of that length, all zero."""
+    headers, found = inspection.sections.get("BLKH"), len(inspection.findings)
+    if headers is None:
+        return None
+    if entry.raw_length % 4:
+        inspection.found("RDM606", entry.place, entry.at + 24)
+        return None
+    nothing = Section(entry.kind, entry.offset, entry.codec, bytes(entry.raw_length))
+    blocks = inspect_headers(inspection, headers, nothing)
+    if int(blocks.k.sum()) != int.from_bytes(inspection.sections["SCEN"].data[:4], "little"):
+        inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
+    return blocks if len(inspection.findings) == found else None
 
 
 def _contents(inspection: Inspection) -> bool:

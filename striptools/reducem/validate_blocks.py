@@ -11,7 +11,7 @@ import numpy as np
 
 from striptools.reducem.inspection import Inspection, Section
 
-__all__ = ["Geometry", "inspect_blocks"]
+__all__ = ["Blocks", "Geometry", "inspect_blocks", "inspect_headers"]
 
 _AT_ONCE = 1 << 15
 """Triangles to decode at once."""
@@ -44,7 +44,7 @@ class Geometry:
 
 
 @dataclass
-class _Blocks:
+class Blocks:
     """The headers of all blocks as int64 columns, and the words of their data.
 
     `base` is the first bit of a block, `first` its first triangle, `bits` its length, `k`, `q` and `s` its
@@ -72,6 +72,7 @@ class _Blocks:
 
     @property
     def base(self) -> np.ndarray:
+        """The first bit of each block."""
         return 32 * self.word
 
     def bit_at(self, bit: int) -> int:
@@ -81,8 +82,7 @@ class _Blocks:
 
 def inspect_blocks(inspection: Inspection) -> Geometry | None:
     """Look at the blocks; gives their geometry where all of them could be decoded and are sound."""
-    blocks = _headers(inspection, inspection.sections["BLKH"], inspection.sections["BLKD"])
-    _places(inspection, blocks)
+    blocks = inspect_headers(inspection, inspection.sections["BLKH"], inspection.sections["BLKD"])
     counted = int(blocks.k.sum()) == int.from_bytes(inspection.sections["SCEN"].data[:4], "little")
     if not counted:
         inspection.found("RDM201", "SCEN", inspection.sections["SCEN"].at(0))
@@ -97,7 +97,14 @@ def inspect_blocks(inspection: Inspection) -> Geometry | None:
     return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, low, high)
 
 
-def _headers(inspection: Inspection, headers: Section, data: Section) -> _Blocks:
+def inspect_headers(inspection: Inspection, headers: Section, data: Section) -> Blocks:
+    """Look at the headers and at where they say that the data of blocks lie."""
+    blocks = _headers(inspection, headers, data)
+    _places(inspection, blocks)
+    return blocks
+
+
+def _headers(inspection: Inspection, headers: Section, data: Section) -> Blocks:
     """Look at each header by itself."""
     rows = np.frombuffer(headers.data, _HEADER)
     k, q, s = (rows["counts"].astype(np.int64) + 1).T
@@ -127,10 +134,10 @@ def _headers(inspection: Inspection, headers: Section, data: Section) -> _Blocks
     check("RDM613", ~wrong & (q > c), 9)
     columns = (word, rows["first"].astype(np.int64), k, q, s, f, c, w, widths, modes)
     exponents, anchors = rows["exponents"].astype(np.int64) - 149, rows["anchors"].astype(np.int64)
-    return _Blocks(headers, data, words, *columns, exponents, anchors, bits, ~wrong & (q <= c))
+    return Blocks(headers, data, words, *columns, exponents, anchors, bits, ~wrong & (q <= c))
 
 
-def _places(inspection: Inspection, blocks: _Blocks) -> None:
+def _places(inspection: Inspection, blocks: Blocks) -> None:
     """Look at where blocks begin and end, and at the words behind the last."""
     headers = blocks.headers
 
@@ -161,7 +168,7 @@ def _places(inspection: Inspection, blocks: _Blocks) -> None:
         )
 
 
-def _chunks(blocks: _Blocks) -> Iterator[np.ndarray]:
+def _chunks(blocks: Blocks) -> Iterator[np.ndarray]:
     """The numbers of the blocks that can be decoded, some at a time."""
     numbers = np.flatnonzero(blocks.whole)
     part = np.cumsum(blocks.c[numbers]) // _AT_ONCE
@@ -183,7 +190,7 @@ def _rows(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return starts, row, np.arange(len(row)) - starts[row]
 
 
-def _decode(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> tuple[np.ndarray, ...] | None:
+def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[np.ndarray, ...] | None:
     """Look at some blocks; gives strip begins, triangle bounds, and bounds over all, where they are sound."""
     strips = _strips(inspection, blocks, chunk)
     index = _indices(inspection, blocks, chunk)
@@ -206,7 +213,7 @@ def _decode(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> tuple
 
 
 def _strips(
-    inspection: Inspection, blocks: _Blocks, chunk: np.ndarray
+    inspection: Inspection, blocks: Blocks, chunk: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Look at start, turn and flip bits; gives the first two where the starts make strips."""
     starts, row, t = _rows(blocks.k[chunk])
@@ -243,7 +250,7 @@ def _too_long(begins: np.ndarray, turns: np.ndarray) -> np.ndarray:
     return ~begins & (since == 30)
 
 
-def _indices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.ndarray | None:
+def _indices(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> np.ndarray | None:
     """Look at the indices; gives them where each names a vertex."""
     _, row, j = _rows(blocks.c[chunk])
     q, w = blocks.q[chunk], blocks.w[chunk]
@@ -274,7 +281,7 @@ def _indices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.n
 
 
 def _corners(
-    blocks: _Blocks, chunk: np.ndarray, index: np.ndarray, begins: np.ndarray, turns: np.ndarray
+    blocks: Blocks, chunk: np.ndarray, index: np.ndarray, begins: np.ndarray, turns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The corners of each triangle, without flips, by the closed form of section 4.3."""
     _, row, _ = _rows(blocks.k[chunk])
@@ -292,7 +299,7 @@ def _corners(
     return a, b, index[at + 2]
 
 
-def _vertices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.ndarray | None:
+def _vertices(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> np.ndarray | None:
     """Look at the coordinates; gives them as (q, 3) float32 where all are finite and exact."""
     _, row, j = _rows(blocks.q[chunk])
     widths = blocks.widths[chunk]
@@ -317,7 +324,7 @@ def _vertices(inspection: Inspection, blocks: _Blocks, chunk: np.ndarray) -> np.
 
 
 def _coordinates(
-    blocks: _Blocks, block: np.ndarray, axis: int, u: np.ndarray, width: np.ndarray
+    blocks: Blocks, block: np.ndarray, axis: int, u: np.ndarray, width: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The float32 coordinates of numbers `u`, and where there is none."""
     mode, number = blocks.modes[block, axis], blocks.anchors[block, axis] + u

@@ -10,30 +10,31 @@ _MAGIC = 0xFD2FB528
 _LARGEST_WINDOW = 2**27
 
 
-def unpack(stored: bytes, raw_length: int) -> tuple[str, bytes]:
+def unpack(stored: bytes, least: int, most: int) -> tuple[str, bytes]:
     """Decode one Zstandard frame.
 
     Args:
         stored: The stored bytes of the section.
-        raw_length: The bytes that must come out; no more are allocated.
+        least: The least bytes that must come out.
+        most: The most; no more are allocated.
 
     Returns:
         The code of an issue, or an empty one, and the decoded bytes.
     """
-    if not _frame_is_allowed(stored, raw_length) or not _frame_is_whole(stored):
+    if not _frame_is_allowed(stored, least, most) or not _frame_is_whole(stored):
         return "RDM121", b""
     decode = _decoder()
     if decode is None:
         return "RDM123", b""
     try:
-        payload = decode(stored, raw_length)
+        payload = decode(stored, most)
     except Exception:
         # Each library has errors of its own; whatever it says, these bytes do not decode.
         return "RDM121", b""
-    return ("", payload) if len(payload) == raw_length else ("RDM121", b"")
+    return ("", payload) if least <= len(payload) <= most else ("RDM121", b"")
 
 
-def _frame_is_allowed(stored: bytes, raw_length: int) -> bool:
+def _frame_is_allowed(stored: bytes, least: int, most: int) -> bool:
     """Whether the frame's header (RFC 8878, 3.1.1) has no dictionary, and window and length within bounds."""
     if len(stored) < 6 or struct.unpack_from("<I", stored)[0] != _MAGIC:
         return False
@@ -52,7 +53,7 @@ def _frame_is_allowed(stored: bytes, raw_length: int) -> bool:
         return True
     field = stored[at : at + size]
     length = int.from_bytes(field, "little") + (256 if size == 2 else 0)
-    return len(field) == size and length == raw_length and not (single and length > _LARGEST_WINDOW)
+    return len(field) == size and least <= length <= most and not (single and length > _LARGEST_WINDOW)
 
 
 def _frame_is_whole(stored: bytes) -> bool:

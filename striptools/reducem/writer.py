@@ -14,7 +14,7 @@ import numpy as np
 
 from striptools.mesh.atomic import write_atomically, write_stream
 from striptools.reducem import layout
-from striptools.reducem.archive import compressed
+from striptools.reducem.archive import packed, packed_blocks
 from striptools.reducem.attributes import encode_columns, encode_materials, section_length
 from striptools.reducem.check import check_scene
 from striptools.reducem.geometries import encode_geometries, encode_instances
@@ -43,7 +43,7 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
     Args:
         scene: The scene; every rule of the format is checked first.
         target: A path, written whole or not at all, or a binary stream.
-        archive: Compress every section but scene record and instances where that makes it smaller.
+        archive: Pack every section but scene record and instances where that makes it smaller.
 
     Returns:
         Bytes written.
@@ -55,7 +55,9 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
         WriteError: The file could not be written whole.
     """
     check_scene(scene)
-    sections = [_stored(section, payload, archive) for section, payload in _payloads(scene) if len(payload)]
+    sections = [
+        _stored(scene, section, payload, archive) for section, payload in _payloads(scene) if len(payload)
+    ]
 
     def write(file: IO[bytes]) -> None:
         for chunk in _chunks(sections):
@@ -139,15 +141,18 @@ def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
     ]
 
 
-def _stored(section: layout.Section, payload: Payload, archive: bool) -> _Stored:
+def _stored(scene: Scene, section: layout.Section, payload: Payload, archive: bool) -> _Stored:
     checksum = zlib.crc32(payload)
     plain = _Stored(section, layout.CODEC_RAW, len(payload), checksum, payload)
     if not archive or section in layout.RAW:
         return plain
-    packed = compressed(payload)
-    if len(packed) >= len(payload):
+    if section is layout.BLOCK_DATA:
+        codec, stored = packed_blocks(scene.blocks, scene.decoded)
+    else:
+        codec, stored = packed(payload, section.kind)
+    if len(stored) >= len(payload):
         return plain
-    return _Stored(section, layout.CODEC_ZSTD, len(payload), checksum, packed)
+    return _Stored(section, codec, len(payload), checksum, stored)
 
 
 def _view(array: Any, kind: str) -> memoryview:

@@ -15,6 +15,7 @@ COLUMNS = (
 )  # fmt: skip
 PACKAGES = (
     "striptools", "numpy", "numba", "trimesh", "jax", "embreex", "meshoptimizer", "vtk", "PyFFI",
+    "DracoPy", "zstandard",
 )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 It is slow and plain on purpose, needs nothing but the standard library and shares no code with striptools.
 Every refusal is a `RefusedError` that names the clause of SPEC.md. It reads raw sections; where an archive
-(codec 1) needs a Zstandard decoder it says so. It checks what sections 3 to 6 rule, but not whether the boxes
+(codecs 1 to 3) needs more it says what. It checks what sections 3 to 6 rule, but not whether the boxes
 of nodes hold what is below them: it decodes them, and a validator looks.
 
     python reader.py FILE          print a summary
@@ -188,7 +188,8 @@ def read_section(data, end, kind, flags, codec, offset, stored_length, raw_lengt
     if codec == 0 and (raw_length, raw_sum) != (stored_length, stored_sum):
         raise RefusedError("3.2", f"{kind!r}: raw, but with two lengths or checksums")
     if codec and kind in MUST_UNDERSTAND:
-        need = "a Zstandard decoder" if codec == 1 else "a newer reader"
+        needs = {1: "a Zstandard decoder", 2: "a Zstandard decoder and section 6.2"}
+        need = (needs | {3: "a Zstandard decoder and section 6.1"}).get(codec, "a newer reader")
         raise RefusedError("6", f"{kind!r}: has codec {codec} and needs {need}; this reads raw sections only")
     return stored
 
@@ -607,7 +608,7 @@ def read_attribute(scene, payload, at, name, domain, components, kind, width, ro
 
 
 def check_rows(scene, name, table, index):
-    """Refuse rows that are not used in the order of their numbers, or are there twice, or name no material."""
+    """Refuse rows that are not used in the order of their numbers, are there twice, or name no material."""
     largest = -1
     for i in index:
         if i > largest + 1:
@@ -621,8 +622,8 @@ def check_rows(scene, name, table, index):
 
 def read_materials(payload):
     """The array of MATL."""
-    if len(payload) > 2**24:
-        raise RefusedError("4.8", "more than 2^24 bytes")
+    if len(payload) > 2**22:
+        raise RefusedError("4.8", "more than 2^22 bytes")
     materials = read_json("4.8", payload)
     if not isinstance(materials, list) or not 1 <= len(materials) <= 65536:
         raise RefusedError("4.8", "no array of 1 to 65,536 materials")

@@ -7,7 +7,26 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
-from make import Axis, Block, Node, Plan, Slot, Strip, Values, bits32, decoding, encode, f32, plain_nodes
+from make import (
+    WIDTHS,
+    Axis,
+    Block,
+    Node,
+    Plan,
+    Slot,
+    Strip,
+    Values,
+    bits32,
+    content,
+    decoding,
+    encode,
+    f32,
+    fold,
+    place,
+    plain_nodes,
+    planes,
+    streams,
+)
 
 LONGEST_LINE = 800
 BIG = f32(0x7F7FFFFF)
@@ -73,6 +92,27 @@ def frame(data: bytes, *, kind: int = 0, descriptor: int = 0xE0, tail: bytes = b
 TRIANGLE = Block([Strip([0, 1, 2])], [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 3.0, 1.0)])
 TURNS = {count: ["".join(bits) for bits in product("01", repeat=count - 1)] for count in (2, 3, 4)}
 FLIPPED = [Strip([0, 1, 2, 3, 4], "01", "01"), Strip([4, 3, 5, 6], "1", "1"), Strip([6, 5, 7])]
+GRID = [(float(x), float(y), float(x * y % 5)) for y in range(4) for x in range(4)]
+ROWS = [Strip([0, 1, 2, 3, 4, 5, 6], "0101"), Strip([1, 7, 3, 8, 9], "01"), Strip([8, 10, 9, 2, 0], "10")]
+SHARED = [
+    Block(ROWS, GRID[:11]),
+    Block([Strip([0, 1, 2, 3, 1], "10"), Strip([3, 4, 0])], [GRID[i] for i in (3, 12, 9, 0, 15)]),
+    Block([zigzag(3)], GRID[4:9]),
+]
+WITH_FLIPS = [Block(FLIPPED, GRID[:8])]
+MODES = [
+    Block([Strip([0, 1, 2])], [(1.0, 0.0, 2.0), (-0.0, 1.0, 2.0), (3.0, 1.0, 0.0)]),
+    Block(
+        [Strip([0, 1, 2])],
+        [(3.0, 1.0, 0.0), (2.0, 2.0, -0.0), (1.0, 0.0, 2.0)],
+        (Axis(place(1.0), 24, 2, 0), None, None),
+    ),
+    Block(
+        [Strip([0, 1, 2])],
+        [(2.0, 2.0, -0.0), (-0.0, 1.0, 2.0), (0.0, 0.0, 0.0)],
+        (Axis(-1, 31, 2, 0), None, None),
+    ),
+]
 DEEP = '{"a": ' + "[" * 31 + '"[[["' + "]" * 31 + "}"
 
 
@@ -302,6 +342,14 @@ def _containers() -> dict[str, tuple[str, Plan]]:
     odd = Plan(blocks_of(2), stored=True, remap=[(3, 0), (2, 1), (1, 2), (0, 0)], metadata={}, order=back)
     packed = dict.fromkeys(("BLKH", "BLKD", "NODE", "RUNS", "RMAP", "META"), frame)
     archive = Plan(blocks_of(2), stored=True, remap=odd.remap, metadata={"unit": "in"}, packed=packed)
+    planed = dict.fromkeys(WIDTHS, 3)
+    records = Plan(
+        [*blocks_of(2), *limited(10)],
+        stored=True,
+        remap=[(13 - t, t % 3) for t in range(14)],
+        packed={kind: lambda data, width=WIDTHS[kind]: frame(planes(data, width)) for kind in planed},
+        codecs=planed,
+    )
     full = Plan([TRIANGLE], extra=[(f"X{i:03}", 0, 0, b"x") for i in range(61)])
     return {
         "unknown_sections": ("sections that nobody knows and nobody needs", Plan([TRIANGLE], extra=unknown)),
@@ -309,6 +357,16 @@ def _containers() -> dict[str, tuple[str, Plan]]:
         "sections_backwards": ("the sections in another order", odd),
         "archive": ("sections of codec 1, their frames without compression", archive),
         "archive_windowed": ("a frame with a window and no length", _windowed()),
+        "archive_planes": ("codec 3 where it may be", records),
+        "archive_blocks": ("codec 2, with vertices that blocks share, named in each way", in_streams(SHARED)),
+        "archive_blocks_flips": (
+            "codec 2, one block of three with flip bits",
+            in_streams(SHARED[:2] + WITH_FLIPS),
+        ),
+        "archive_blocks_modes": ("codec 2, vertices that blocks share in several modes", in_streams(MODES)),
+        "archive_blocks_large": ("codec 2, 256 vertices and triangles", in_streams(limited(300))),
+        "archive_blocks_first": ("codec 2, block data before block headers", _data_first()),
+        "archive_blocks_told_twice": ("codec 2, a known vertex told as a new one", _told_twice()),
     }
 
 
@@ -358,6 +416,32 @@ def _origins() -> dict[str, tuple[str, Plan]]:
         "origin": ("positions about an origin", Plan([TRIANGLE], record=origin)),
         "origin_tiny": ("the smallest origin", Plan([TRIANGLE], record=tiny)),
     }
+
+
+def in_streams(blocks: list[Block], change: Callable[[dict], object] = dict, **fields) -> Plan:
+    """A plan whose block data have codec 2, its streams changed in place."""
+
+    def pack(_: bytes) -> bytes:
+        made = streams(blocks)
+        change(made)
+        return frame(content(made))
+
+    return Plan(blocks, packed={"BLKD": pack}, codecs={"BLKD": 2}, **fields)
+
+
+def _data_first() -> Plan:
+    return in_streams(SHARED, order=("SCEN", "BLKD", "BLKH", "NODE"))
+
+
+def _told_twice() -> Plan:
+    block = triangle((0.0, 1.0, 2.0))
+
+    def tell(made: dict) -> None:
+        made["known"], made["places"] = [0] * 6, []
+        for name in "xyz":
+            made[name] *= 2
+
+    return in_streams([block, block], tell)
 
 
 def _windowed() -> Plan:
@@ -461,6 +545,7 @@ def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
         _materials(),
         _geometries(),
         _matrices(),
+        _streams(),
     ):
         made |= group
     return made
@@ -698,6 +783,13 @@ def _block_headers() -> dict[str, tuple[str, list[str], bytes]]:
         "block_vertices_many": many,
         "block_flags": header("a reserved flag of a block", "RDM107", flags=2),
         "block_reserved": header("a reserved field of a block", "RDM107", reserved=0x8000),
+        # Found by the fuzzer, likewise.
+        "word_and_length": wrong(
+            "a block begins where another one does, and zero words are missing",
+            "RDM602 RDM606",
+            Plan(gap),
+            payloads={"BLKD": lambda data: data[:-64]},
+        ),
         "axis_width": wrong("a width of 33 bits", "RDM604", Plan([wide])),
         "axis_mode": header("mode 3", "RDM604", axis_y=2 | 3 << 6),
         "axis_mode_1": wrong("mode 1 without a bit", "RDM604", Plan([minus])),
@@ -918,6 +1010,14 @@ def _runs() -> dict[str, tuple[str, list[str], bytes]]:
         "run_over_blocks": of("a run that ends behind its block", "RDM802", (0, 2), (2, 3)),
         "run_too_long": of("a run longer than the longest", "RDM802", *plain[0], record={"longest_run": 1}),
         "run_overlap": of("a triangle in two runs", "RDM803", (0, 2), (1, 1)),
+        # Found by the fuzzer: a validator that stops at the runs does not see what the nodes make of them.
+        "run_gap_and_lost": wrong(
+            "a triangle in no run, and a run that no slot names",
+            "RDM704 RDM803",
+            pair,
+            runs=[[(0, 2), (2, 1)], plain[1]],
+            nodes=[pair.nodes[0], pair.nodes[1]._replace(slots=pair.nodes[1].slots[:1]), pair.nodes[2]],
+        ),
         "run_gap": of("a triangle in no run", "RDM803", (0, 2), (2, 1)),
     }
 
@@ -1086,7 +1186,7 @@ def _matrices() -> dict[str, tuple[str, list[str], bytes]]:
         "instance_order": of("faces that begin too early", "RDM554", (1, 0, IDENTITY), (0, 1, MIRROR)),
         "instance_faces": of("too many faces", "RDM554", (1, 0, IDENTITY), (0, 2**32 - 4, MIRROR)),
         "instance_cut": wrong("half a record", "RDM114", _placed(), payloads={"INST": lambda d: d[:-4]}),
-        "instance_packed": wrong("instances that are not raw", "RDM120", _placed(), packed=packed),
+        "instance_packed": wrong("instances that are not raw", "RDM125", _placed(), packed=packed),
     }
 
 
@@ -1120,10 +1220,10 @@ def _materials() -> dict[str, tuple[str, list[str], bytes]]:
     many = Plan(PAIR.blocks, attributes=[GROUPS], materials=[RED, GLASS])
     return made | {
         "materials_long": wrong(
-            "materials of 2^24 + 1 bytes",
+            "materials of 2^22 + 1 bytes",
             "RDM532",
             many,
-            payloads={"MATL": lambda _: bytes(2**24 + 1)},
+            payloads={"MATL": lambda _: bytes(2**22 + 1)},
             packed={"MATL": lambda data: frame(data[:100], kind=1)},
         ),
         "materials_alone": wrong("materials and no groups", "RDM117", PAIR, materials=[RED]),
@@ -1141,7 +1241,7 @@ def _packed() -> dict[str, tuple[str, list[str], bytes]]:
     large = Plan([TRIANGLE], metadata=b"{}")
     return {
         "packed_scene": pack("a packed scene record", "RDM120", frame, "SCEN"),
-        "packed_unknown": wrong("an unknown codec", "RDM119", ONE, entries={"BLKD": {"codec": 2}}),
+        "packed_unknown": wrong("an unknown codec", "RDM119", ONE, entries={"BLKD": {"codec": 4}}),
         "packed_unknown_remap": wrong("an unknown codec", "RDM119", BASE, entries={"RMAP": {"codec": 65535}}),
         "packed_raw": pack("codec 1 and no frame", "RDM121", bytes),
         "packed_cut": pack("a frame cut short", "RDM121", lambda data: frame(data)[:-1]),
@@ -1177,6 +1277,71 @@ def _packed() -> dict[str, tuple[str, list[str], bytes]]:
             packed={"META": lambda data: frame(data[:100], kind=1)},
         ),
     }
+
+
+def _streams() -> dict[str, tuple[str, list[str], bytes]]:
+    def other(kind: str, codec: int, plan: Plan) -> tuple:
+        return wrong("a codec of another kind", "RDM125", plan, packed={kind: frame}, codecs={kind: codec})
+
+    def off(about: str, change: Callable[[dict], object], blocks: list[Block] = SHARED, **fields) -> tuple:
+        return about, ["RDM126"], encode(in_streams(blocks, change, **fields))
+
+    def put(name: str, at: int, value: int) -> Callable[[dict], None]:
+        return lambda made: made[name].__setitem__(at, value)
+
+    one = Strip([0, 1, 2])
+    fine = Block([one], [(0.5, 0.0, 1.0), (0.0, 0.5, 1.0), (1.0, 1.0, 1.0)])
+    coarse = Block([one], [(1.0, 1.0, 1.0), (4.0, 0.0, 1.0), (0.0, 4.0, 1.0)])
+    huge = f32(0xFF7FFFFF)
+    bits = triangle((0.0, 1.0, 2.0), Axis(place(huge), 32, 2, 0))
+    no_value = fold(0x7F800000 - place(huge), 32)
+    cases = {
+        "ends_early": off("a byte too few", lambda made: made["z"].pop()),
+        "ends_late": off("a number too many", lambda made: made["z"].append(0)),
+        "unused": off("an unused bit of the turns", lambda made: made["turns"].append(1)),
+        "unused_ways": off("an unused bit of the ways", lambda made: made["ways"].append(2)),
+        "no_start": off("a block without a start bit", put("starts", 0, 0)),
+        "too_many_starts": off("more starts than strips", put("starts", 1, 1)),
+        "too_few_starts": off("fewer starts than strips", put("starts", 5, 0)),
+        "no_edge": off("a first vertex beside an edge", put("ways", 0, 1)),
+        "no_before": off("a vertex before none", put("ways", 1, 1)),
+        "no_after": off("a vertex after none", put("ways", 1, 2)),
+        "step_too_far": off("a step before the first vertex", put("steps", 0, 7)),
+        "too_many": off("more new vertices than the block has", lambda made: _renamed(made, 7)),
+        "no_place": off("a known vertex that has not come", put("places", 0, fold(11, 32))),
+        "negative_place": off("a known vertex before the first", put("places", 0, fold(-1, 32))),
+        "no_number": off("a known vertex off the block's multiples", put("places", 0, 0), [fine, coarse]),
+        "rest_too_wide": off("a rest of more bits than the width", put("x", 0, 4)),
+        "no_value": off("a known vertex that is no number", put("x", 0, no_value), [bits, bits]),
+    }
+    many = [("BLKD", 3, ONE), ("META", 3, BASE), ("NODE", 2, BASE), ("RMAP", 2, BASE), ("META", 2, BASE)]
+    made = {f"codec_{codec}_of_{kind.lower()}": other(kind, codec, plan) for kind, codec, plan in many}
+    made |= {f"streams_{name}": case for name, case in cases.items()}
+    plan = in_streams(SHARED)
+    shifted = [replace(SHARED[0], header={"first_triangle": 1}), *SHARED[1:]]
+    made["streams_headers"] = wrong("codec 2 and a header that is wrong", "RDM601", plan, blocks=shifted)
+    made["streams_too_long"] = wrong(
+        "a frame of more bytes than the headers allow",
+        "RDM121",
+        plan,
+        packed={"BLKD": lambda _: frame(bytes(999))},
+    )
+    made["streams_odd_length"] = wrong(
+        "codec 2 and block data of no whole words", "RDM606", plan, entries={"BLKD": {"raw_length": 130}}
+    )
+    made["streams_other_bits"] = wrong(
+        "a checksum of other bytes", "RDM122", plan, entries={"BLKD": {"raw_checksum": 1}}
+    )
+    made["planes_other_length"] = wrong(
+        "planes of another length", "RDM121", ONE, packed={"BLKH": lambda d: frame(d[1:])}, codecs={"BLKH": 3}
+    )
+    return made
+
+
+def _renamed(made: dict, at: int) -> None:
+    """Name a vertex that is not new as if it were."""
+    made["ways"][at] = 0
+    made["steps"].pop(0)
 
 
 def _window(data: bytes, byte: int) -> bytes:

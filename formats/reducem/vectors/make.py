@@ -202,6 +202,103 @@ def walk(strip: Strip) -> list[list[int]]:
     return faces
 
 
+# Codecs
+
+WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 2, "RMAP": 4}
+
+
+def planes(data: bytes, width: int) -> bytes:
+    """First all first bytes of the records, then all second ones, and then what is left."""
+    rows = len(data) // width
+    return b"".join(data[k : rows * width : width] for k in range(width)) + data[rows * width :]
+
+
+class Named(NamedTuple):
+    """How a strip vertex is named: its way, its step where that is 3, a, b, o of its guess where new."""
+
+    way: int
+    step: int = 0
+    guess: tuple[int, int, int] = (-1, -1, -1)
+
+
+def name_vertices(block: Block) -> list[Named]:
+    """The strip vertices of a block as section 6.2 names them; -1 in a guess stands for zero."""
+    named, after, before, largest = [], {}, {}, -1
+    for strip in block.strips:
+        a = b = c = o = -1
+        for t in range(len(strip.turns) + 1):
+            if t:
+                a, b, o = (a, c, b) if strip.turns[t - 1] == "1" else (c, b, a)
+            for corner in range(2 if t else 0, 3):
+                w = strip.index[t + corner]
+                if w > largest:
+                    last = strip.index[corner - 1] if corner else largest
+                    named.append(Named(0, 0, (a, b, o) if t else (last, last, last)))
+                elif corner and before.get(a if corner == 1 else b) == w:
+                    named.append(Named(1))
+                elif corner and after.get(a) == w:
+                    named.append(Named(2))
+                else:
+                    named.append(Named(3, largest - w))
+                largest = max(largest, w)
+                a, b, c = (w if i == corner else x for i, x in enumerate((a, b, c)))
+            for x, y in ((a, b), (b, c), (c, a)):
+                if after.get(y) != x:
+                    after[x], before[y] = y, x
+    return named
+
+
+def fold(difference: int, width: int) -> int:
+    """A difference of numbers of some bits as twice its size, less one where it is negative."""
+    difference %= 2**width
+    return 2 * difference if 2 * difference < 2**width else 2 * (2**width - 1 - difference) + 1
+
+
+def streams(blocks: list[Block]) -> dict[str, list[int]]:
+    """The numbers in the streams of codec 2; each vertex that can be is told as a known one."""
+    names = ("starts", "turns", "flips", "ways", "steps", "known", "places", "x", "y", "z")
+    made: dict[str, list[int]] = {name: [] for name in names}
+    distinct: dict[tuple[int, ...], int] = {}
+    last = 0
+    for block in blocks:
+        made["starts"] += [int(i == 0) for length in block.lengths for i in range(length)]
+        made["turns"] += [int(bit) for strip in block.strips for bit in "0" + strip.turns]
+        if block.has_flips:
+            made["flips"] += [int(x) for s in block.strips for x in "0" + (s.flips or "0" * len(s.turns))]
+        named = name_vertices(block)
+        made["ways"] += [one.way for one in named]
+        made["steps"] += [one.step for one in named if one.way == 3]
+        columns = list(zip(*block.points, strict=True))
+        axes = [axis or narrowest(list(c)) for axis, c in zip(block.axes, columns, strict=True)]
+        numbers = [[number(x, axis) for x, axis in zip(p, axes, strict=True)] for p in block.points]
+        guesses = [one.guess for one in named if one.way == 0]
+        for point, row, guess in zip(block.points, numbers, guesses, strict=True):
+            key = tuple(bits32(x) for x in point)
+            made["known"].append(int(key in distinct))
+            if key in distinct:
+                made["places"].append(fold(distinct[key] - last, 32))
+                last = distinct[key]
+                continue
+            distinct[key] = len(distinct)
+            a, b, o = (numbers[i] if i >= 0 else (0, 0, 0) for i in guess)
+            for i, name in enumerate("xyz"):
+                made[name].append(fold(row[i] - (a[i] + b[i] - o[i]), axes[i].width))
+    return made
+
+
+def content(made: dict[str, list[int]]) -> bytes:
+    """The bytes in the frame of codec 2 that hold these streams."""
+    widths = {"starts": 1, "turns": 1, "flips": 1, "ways": 2, "steps": 8, "known": 1}
+    parts = []
+    for name, values in made.items():
+        if name in widths:
+            bits = stream([(value, widths[name]) for value in values])
+            parts.append(bits[: -(-len(values) * widths[name] // 8)])
+        else:
+            parts.append(planes(struct.pack(f"<{len(values)}I", *values), 4))
+    return b"".join(parts)
+
+
 # Nodes
 
 
@@ -409,7 +506,8 @@ class Plan:
         cells: The exponents of the cells of plain nodes.
         record: Fields of SCEN that hold something else.
         payloads: For a kind, what is done to the bytes of the section before it is written.
-        packed: For a kind, what makes its stored bytes, which get codec 1.
+        packed: For a kind, what makes its stored bytes.
+        codecs: For a packed kind its codec; None for 1.
         entries: For a kind, fields of its row in the section table that hold something else.
         extra: Further sections `(kind, flags, codec, bytes)`.
         drop: Kinds to leave out.
@@ -435,6 +533,7 @@ class Plan:
     record: dict = field(default_factory=dict)
     payloads: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
     packed: dict[str, Callable[[bytes], bytes]] = field(default_factory=dict)
+    codecs: dict[str, int] = field(default_factory=dict)
     entries: dict[str, dict] = field(default_factory=dict)
     extra: list[tuple[str, int, int, bytes]] = field(default_factory=list)
     drop: tuple[str, ...] = ()
@@ -468,7 +567,7 @@ def encode(plan: Plan) -> bytes:
     rows = [(kind, int(kind in MUST_UNDERSTAND), 0, data, data) for kind, data in payloads.items()]
     rows += [(kind, flags, codec, data, data) for kind, flags, codec, data in plan.extra]
     rows = [
-        (kind, flags, 1, plan.packed[kind](raw), raw)
+        (kind, flags, plan.codecs.get(kind, 1), plan.packed[kind](raw), raw)
         if kind in plan.packed
         else (kind, flags, codec, data, raw)
         for kind, flags, codec, data, raw in rows

@@ -78,6 +78,8 @@ def _read_vertices(lines: list[bytes]) -> np.ndarray:
     if len(lengths) > 1:
         lines = [b" ".join(line.split()[:3]) for line in lines]
     table = b"v " + b"\nv ".join(lines) + b"\n"
+    if not table.isascii():
+        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN)
     odd = BROKEN_EXPONENT.search(table)
     if odd:
         place = table.count(b"\n", 0, odd.start()) + 1

@@ -50,7 +50,10 @@ def read_off(file: IO[bytes]) -> Parsed:
     faces = corners[fans.corners]
     _require_indices(faces, vertex_count)
     rows = "\n".join(f"3 {a} {b} {c}" for a, b, c in faces.tolist()).encode()
-    text = b"OFF\n%d %d 0\n" % (vertex_count, len(faces)) + b"\n".join(vertices) + b"\n" + rows
+    table = b"\n".join(vertices)
+    if not table.isascii():
+        raise UnreadableMeshError("text where a number should be", remedy=EXPORT_AGAIN)
+    text = b"OFF\n%d %d 0\n" % (vertex_count, len(faces)) + table + b"\n" + rows
     with strict_numbers():
         found = load_off(BytesIO(text))
     attributes, notes = _read_attributes(kind, vertices, polygons, fans)

@@ -1,0 +1,30 @@
+"""How kernels are compiled: one decorator for each part that a function can play.
+
+All keep the compiled code beside the source's cache, and let other Python threads run. Wrappers that nobody
+calls cost a good part of the time of compiling a small function, so only a `kernel` has one. Counting
+references costs two atomic additions for each array of a named tuple and call, which made up most of the time
+of the search for tunnels: a `helper` counts none, and in return may neither make arrays nor return one.
+"""
+
+from typing import Any
+
+from numba import njit
+
+_ALL: dict[str, Any] = {"cache": True, "nogil": True, "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = _ALL | {"no_cpython_wrapper": True}
+_FRUGAL: dict[str, Any] = _INNER | {"_nrt": False}
+
+kernel = njit(**_ALL)
+"""Called from Python, or from anywhere."""
+
+maker = njit(**_INNER)
+"""Called by kernels alone; may make arrays."""
+
+helper = njit(**_FRUGAL)
+"""Called by kernels alone; makes no array."""
+
+inlined = njit(**_FRUGAL, forceinline=True)
+"""A helper that is copied to where it is called: for inner loops, as a call passes arrays word by word."""
+
+spliced = njit(inline="always")
+"""Called from one place, or tiny: becomes part of its caller before anything is compiled."""
