@@ -13,22 +13,24 @@ import numpy as np
 
 from striptools import __version__
 from striptools.errors import UnreadableMeshError, UsageError
-from striptools.hierarchies.packed import box_grid, build_top
+from striptools.hierarchies.packed import BoxGrid, box_grid, build_top
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import face_boxes, range_boxes
-from striptools.partition.object_split import split_objects
+from striptools.partition.object_split import ObjectTree, split_objects
 from striptools.partition.sah import PartitionOptions
 from striptools.reducem.attributes import fitting
+from striptools.reducem.joining import Built, join_geometries, stored_instances, why_not_kept
 from striptools.reducem.quantize import PrecisionOptions, check_bound, quantise, recentred_bound
 from striptools.reducem.reader import open_scene
 from striptools.reducem.scene import BoxesKind, Scene, bounds_of, scene_from_strips
 from striptools.stopwatch import Stopwatch, Watch
 from striptools.strips.grouping import reorder_blocks, stripify_in_blocks
-from striptools.strips.ordering import OrderingOptions
+from striptools.strips.ordering import OrderingOptions, Sequences
 from striptools.strips.topology import encode_strips, split_fans
 from striptools.threads import every_core
+from striptools.types import Boxes, Counts
 
 STAGES = ("load", "clean", "quantise", "partition", "order", "hierarchy", "output")
 """The stages of a conversion, in order; `order` finds the neighbours too, range by range; a command that
@@ -47,6 +49,9 @@ class Options:
         boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
         geometry_only: Leave out normals, texture coordinates, colours, groups and materials.
+        instances: Store a mesh that a glTF scene has in several places once, with a matrix for each. A grid
+            is then one for all geometries, in their own frames, as fine as the largest stretch asks for; the
+            bound that a scene declares is told in those frames too.
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:
@@ -60,6 +65,7 @@ class Options:
     boxes: BoxesKind = "rebuilt"
     remap: bool = True
     geometry_only: bool = False
+    instances: bool = True
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -144,35 +150,39 @@ def convert_with_report(
     threads = options.threads or every_core()
     clock = Stopwatch(watch)
     with clock.stage("load"):
-        mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format)
-        mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
+        mesh = _loaded(source, file_format, options)
         metadata = _metadata(source, mesh)
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)
         _refuse_nothing(cleaned)
-        source_face_count, notes = mesh.triangle_count, mesh.notes
+        source_face_count, notes, numbers = mesh.triangle_count, mesh.notes, mesh.geometries
     with clock.stage("quantise"):
         cleaned, exponent, bound, largest_error = _quantised(mesh, cleaned, options, threads)
         faces, positions = cleaned.mesh.faces, cleaned.mesh.positions
         del mesh, source
     with clock.stage("partition"):
-        boxes = face_boxes(positions, faces, threads)
-        block = options.ordering.block if options.ordering.method == "strip-rt" else None
-        tree = split_objects(
-            boxes, replace(options.partition, block=block or options.partition.block), threads=threads
-        )
+        parts = [part for part in cleaned.mesh.parts() if part.triangle_count]
+        boxes = [face_boxes(part.positions, part.faces, threads) for part in parts]
+        trees = [_partitioned(box, options, threads) for box in boxes]
     with clock.stage("order"):
-        progress = None if watch is None else partial(watch, "order")
-        given = (faces, len(positions), boxes, tree, options.ordering, options.partition)
-        sequences, starts = stripify_in_blocks(*given, threads, progress)
-        del tree, given
+        told = [None if watch is None else partial(_tell, watch, k, len(parts)) for k in range(len(parts))]
+        ordered = [
+            stripify_in_blocks(
+                part.faces,
+                part.vertex_count,
+                *(box, tree, options.ordering, options.partition, threads, tell),
+            )
+            for part, box, tree, tell in zip(parts, boxes, trees, told, strict=True)
+        ]
+        del trees
     with clock.stage("hierarchy"):
-        block_boxes = range_boxes(boxes, starts, sequences.faces)
-        order, top = build_top(block_boxes, np.diff(starts), box_grid(*bounds_of(positions)), threads)
-        sequences, starts = reorder_blocks(sequences, starts, order)
-        del boxes, block_boxes
+        grid = box_grid(*bounds_of(positions))
+        built = [_built(*one, box, grid, threads) for one, box in zip(ordered, boxes, strict=True)]
+        sequences, starts, top, roots = join_geometries(built)
+        del boxes, ordered, built
     with clock.stage("output"):
         strips = split_fans(encode_strips(faces, sequences, threads), faces, threads)
+        geometries, instances = stored_instances(cleaned.mesh, roots, numbers)
         scene = scene_from_strips(
             positions,
             strips,
@@ -184,11 +194,15 @@ def convert_with_report(
             error_bound=bound,
             metadata=metadata,
             origin=cleaned.origin,
+            geometries=geometries,
+            instances=instances,
             threads=threads,
         ).with_attributes(cleaned.mesh, strips)
         if options.boxes == "stored":
             scene = scene.storing_boxes(threads)
     counts = cleaned.counts | {"strips": scene.strip_count, "blocks": scene.block_count}
+    if scene.instances is not None:
+        counts |= {"geometries": len(roots.blocks) - 1, "instances": len(scene.instances)}
     seconds, peak = clock.read()
     moved = (cleaned.largest_rounding, cleaned.weld_error, exponent, largest_error)
     return scene, Report(seconds, peak, counts, *moved, notes, cleaned.origin)
@@ -210,6 +224,36 @@ def open(source: str | Path | IO[bytes]) -> Scene:
         UnreadableSceneError: The file is missing, damaged, or no scene file of a version that is read here.
     """
     return open_scene(source)
+
+
+def _loaded(source: Mesh | str | Path | IO[bytes], file_format: str | None, options: Options) -> Mesh:
+    """The mesh, with instances where they are asked for and can be kept."""
+    keep = options.instances
+    mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
+    mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
+    if keep and mesh.instances is not None:
+        reason = why_not_kept(mesh)
+        if reason is None:
+            return mesh
+        mesh = replace(mesh, notes=(*mesh.notes, f"instances flattened, for {reason}"))
+    return mesh.flattened()
+
+
+def _partitioned(boxes: Boxes, options: Options, threads: int) -> ObjectTree:
+    block = options.ordering.block if options.ordering.method == "strip-rt" else None
+    partition = replace(options.partition, block=block or options.partition.block)
+    return split_objects(boxes, partition, threads=threads)
+
+
+def _tell(watch: Watch, part: int, parts: int, fraction: float) -> None:
+    watch("order", (part + fraction) / parts)
+
+
+def _built(sequences: Sequences, starts: Counts, boxes: Boxes, grid: BoxGrid, threads: int) -> Built:
+    """The nodes over the blocks of a geometry, and its blocks in their order."""
+    block_boxes = range_boxes(boxes, starts, sequences.faces)
+    order, top = build_top(block_boxes, np.diff(starts), grid, threads)
+    return Built(*reorder_blocks(sequences, starts, order), top)
 
 
 def _refuse_nothing(cleaned: Cleaned, prefix: str = "") -> None:

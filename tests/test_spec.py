@@ -18,6 +18,7 @@ SPEC = (FORMAT / "SPEC.md").read_text(encoding="utf-8")
 EXAMPLE = SPEC.split("## 9. A worked example", 1)[1]
 TYPES = {
     **{"8 x char": "S8", "4 x char": "S4", "8 x u8": "8u1", "24 x u8": "24u1", "u8": "u1"},
+    "12 x f64": "12<f8",
     **{f"{kind}{8 * size}": f"<{kind}{size}" for kind in "iuf" for size in (2, 4, 8)},
 }
 LENGTHS = {

@@ -172,6 +172,13 @@ def run(
         str | None,
         typer.Option("--to", metavar="FORMAT", help="Format of OUT.", show_default="extension"),
     ] = None,
+    instances: Annotated[
+        bool,
+        typer.Option(
+            "--instances/--no-instances",
+            help="Store a mesh that a glTF scene has in several places once, or flatten the scene.",
+        ),
+    ] = _OPTIONS.instances,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Add seconds by stage, bytes by part.")
@@ -188,6 +195,7 @@ def run(
     options = Options(
         clean=CleanOptions(weld, drop_duplicates, cast(Recentring, recentre)),
         geometry_only=geometry_only,
+        instances=instances,
         ordering=OrderingOptions(
             max_length,
             cast(Method, stripifier),
@@ -317,14 +325,15 @@ def _to_mesh(
         with clock.stage("load"):
             scene = read_scene(source.file)
         with clock.stage("decode"):
-            mesh = scene.to_mesh()
+            stored = scene.to_mesh()
+            mesh = stored if formats[1] == "glb" else stored.flattened()
         with clock.stage("write"):
             target.write(lambda file: save_mesh(mesh, file, file_format=formats[1]))
     seconds, peak = clock.read()
     order = "in the source's order" if scene.remap else "in file order, for the scene has no remap"
     line = f"{_arrow(source, target)}, {mesh.triangle_count:,} triangles {order}"
     counts = {"triangles": mesh.triangle_count, "vertices": mesh.vertex_count, "strips": scene.strip_count}
-    left_out = unkept(mesh, formats[1])
+    left_out = unkept(stored, formats[1])
     facts = {"seconds": seconds, "peak_bytes": peak, "counts": counts, "left_out": list(left_out)}
     lines = [line, *([f"  left out: {', '.join(left_out)}"] if left_out else [])]
     return _Outcome(lines, list(_details(seconds, scene)), facts)
@@ -372,7 +381,7 @@ def _loaded_clean(
 ) -> tuple[Mesh, list[str], dict[str, int]]:
     """A mesh fit for strips, what loading and cleaning have to say, and cleaning's counts."""
     if read_format == SCENE_FORMAT:
-        mesh = read_scene(source.file).to_mesh().geometry()
+        mesh = read_scene(source.file).flattened().geometry()
         return mesh, [f"  {note}" for note in mesh.notes], {}
     mesh = load_mesh(source.file, file_format=read_format or None).geometry()
     # A mesh has no place for an origin.
@@ -390,8 +399,11 @@ def _arrow(source: Source, target: Target) -> str:
 
 
 def _density(scene: Scene) -> str:
+    placed = (
+        "" if scene.instances is None else f", {scene.placed_count:,} in {len(scene.instances):,} instances"
+    )
     return (
-        f"{scene.triangle_count:,} triangles, "
+        f"{scene.triangle_count:,} triangles{placed}, "
         f"{len(scene.vertices) / scene.triangle_count:.2f} vertices per triangle, "
         f"{scene.bytes_per_triangle():.1f} bytes per triangle"
     )

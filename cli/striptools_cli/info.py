@@ -24,6 +24,8 @@ def run(
     for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
     what tracing needs, so every part but the remap and attributes, before compression;
     `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all.
+    Where a scene has instances all of that is of the geometries, stored once; `placed_triangles` are those
+    of all instances.
     """
     log.set_up()
     file = Source.open(source)
@@ -73,6 +75,14 @@ def _carried(scene: Scene) -> dict[str, object]:
         }
     if scene.materials:
         found["materials"] = len(scene.materials)
+    if scene.instances is not None and scene.geometries is not None:
+        found["instances"] = {
+            "geometries": len(scene.geometries),
+            "instances": len(scene.instances),
+            "placed_triangles": scene.placed_count,
+            "bytes": scene.part_bytes()["instances"],
+            "bytes_per_placed_triangle": _share(sum(scene.part_bytes().values()), scene.placed_count),
+        }
     if scene.origin is not None:
         found["origin"] = scene.origin.tolist()
     return found

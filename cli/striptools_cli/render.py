@@ -69,7 +69,8 @@ def run(
     with StageProgress(quiet=quiet) as progress:
         progress.watch("load", 0.0)
         loaded = read_scene(file.file)
-        camera = Camera.framing(loaded.positions, width=width, height=height, fov=fov, view=place, up=up)
+        shown = loaded.placed().positions
+        camera = Camera.framing(shown, width=width, height=height, fov=fov, view=place, up=up)
         notice.before_tracing(quiet=quiet)
         progress.watch("trace", 0.0)
         tracer = Tracer(loaded, device=device, threads=threads)

@@ -63,7 +63,8 @@ def run(
     with StageProgress(quiet=quiet) as progress:
         progress.watch("load", 0.0)
         loaded = read_scene(scene_file.file)
-        source = load_mesh(mesh_file.file, file_format=input_format(mesh_file, from_format) or None)
+        kind = input_format(mesh_file, from_format) or None
+        source = load_mesh(mesh_file.file, file_format=kind, instances=loaded.instances is not None)
         notice.before_tracing(quiet=quiet)
         tracer = Tracer(loaded, device=device, threads=threads)
         report = verify(loaded, source, options, tracer=tracer, watch=progress.watch)

@@ -20,6 +20,7 @@ Boxes are put on the grid outward: the first and last border of cells by exact a
 Cost: O(n) for blocks of bounded size; 64 bytes of room a triangle of the `JOB` blocks in work.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,10 +39,12 @@ __all__ = [
     "LONGEST_RUN",
     "BoxGrid",
     "PackedNodes",
+    "Roots",
     "box_grid",
     "build_inner",
     "build_top",
     "check_packed",
+    "join_tops",
     "wide_tree",
 ]
 
@@ -109,6 +112,21 @@ class PackedNodes:
     longest_run: int
 
 
+@dataclass(frozen=True, eq=False)
+class Roots:
+    """Which blocks and which nodes over blocks each geometry has, where a scene has several.
+
+    The root of a geometry is its first node over blocks, or that of its only block.
+
+    Attributes:
+        blocks: (g+1,) int64, the first block of each geometry, then b.
+        tops: (g+1,) int64, its first node over blocks, then how many there are.
+    """
+
+    blocks: np.ndarray
+    tops: np.ndarray
+
+
 def box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
     """The finest grid on which the scene is below `MOST_CELLS` cells long on each axis.
 
@@ -148,6 +166,17 @@ def build_top(
         boxes, tree.size, tree.order, grid.low, grid.per_unit, words, words.view(np.uint8), order
     )
     return order, words[:count].copy()
+
+
+def join_tops(tops: Sequence[NodeWords], roots: Roots) -> NodeWords:
+    """Put the nodes over the blocks of geometries one after another, each of `build_top`, (t, 16) uint32."""
+    joined = []
+    for top, block, node in zip(tops, roots.blocks.tolist(), roots.tops.tolist(), strict=False):
+        moved, slots = top.copy(), _slots(top)
+        moved[:, 0] += np.where(slots.inner.any(axis=1), node, 0).astype(np.uint32)
+        moved[:, 1] += np.where(slots.leaf.any(axis=1), block, 0).astype(np.uint32)
+        joined.append(moved)
+    return np.concatenate(joined)
 
 
 def build_inner(
@@ -256,7 +285,12 @@ def wide_tree(packed: PackedNodes, triangle_boxes: Boxes, block_starts: Counts) 
 
 
 def check_packed(
-    packed: PackedNodes, grid: BoxGrid, triangle_boxes: Boxes, block_starts: Counts, strip_starts: Counts
+    packed: PackedNodes,
+    grid: BoxGrid,
+    triangle_boxes: Boxes,
+    block_starts: Counts,
+    strip_starts: Counts,
+    roots: Roots | None = None,
 ) -> None:
     """Make sure that nodes reach each block and each run once, and that every box holds what is below it.
 
@@ -268,15 +302,17 @@ def check_packed(
         triangle_boxes: (n, 6) float32, in file order.
         block_starts: (b+1,) int32, in triangles.
         strip_starts: (s+1,) int32, in triangles.
+        roots: Of several geometries; None for one.
 
     Raises:
         UnreadableSceneError: Naming the first flaw found.
     """
     blocks = len(block_starts) - 1
-    _check_counts(packed, blocks)
+    roots = roots or Roots(np.array([0, blocks]), np.array([0, packed.top_count]))
+    _check_counts(packed, blocks, roots)
     slots = _slots(packed.nodes)
     _check_slots(packed.nodes, slots)
-    child = _check_links(packed, slots, blocks)
+    child = _check_links(packed, slots, blocks, roots)
     if packed.runs is None:
         first, count = block_starts[:-1].astype(np.int32), np.diff(block_starts).astype(np.int32)
     else:
@@ -312,11 +348,12 @@ def _slots(nodes: NodeWords) -> _Slots:
     return _Slots(inner, empty, sides[:, 0], sides[:, 1])
 
 
-def _check_counts(packed: PackedNodes, blocks: int) -> None:
+def _check_counts(packed: PackedNodes, blocks: int, roots: Roots) -> None:
     """Nodes, blocks and runs are of one scene."""
     complete = packed.runs is not None
     _require(complete == (packed.first_run is not None), "runs are not there as a whole")
-    _require(packed.top_count >= 1 if blocks > 1 else packed.top_count == 0, "a wrong number of top nodes")
+    several, tops = np.diff(roots.blocks) > 1, np.diff(roots.tops)
+    _require(bool(((tops >= 1) == several).all()) and tops.min() >= 0, "a wrong number of top nodes")
     least = packed.top_count + (blocks if complete else 0)
     enough = len(packed.nodes) >= least if complete else len(packed.nodes) == least
     _require(enough, "a wrong number of nodes")
@@ -334,7 +371,7 @@ def _check_slots(nodes: NodeWords, slots: _Slots) -> None:
     _require(not slots.empty.all(axis=1).any(), "a node has no child")
 
 
-def _check_links(packed: PackedNodes, slots: _Slots, blocks: int) -> SlotChildren:
+def _check_links(packed: PackedNodes, slots: _Slots, blocks: int, roots: Roots) -> SlotChildren:
     """Each node, block and run is reached once, from where it may be; gives the children of all slots."""
     top, nodes = packed.top_count, packed.nodes.astype(np.int64)
     complete = packed.runs is not None
@@ -343,20 +380,31 @@ def _check_links(packed: PackedNodes, slots: _Slots, blocks: int) -> SlotChildre
     ranks = np.cumsum(slots.leaf, axis=1) - 1
     is_top = node < top
     least = np.where(is_top, node, np.maximum(node, top - 1 + blocks * complete))
-    allowed = (target > least) & (target < np.where(is_top, top, len(nodes)))
+    end = np.append(np.repeat(roots.tops[1:], np.diff(roots.tops)), np.full(len(nodes) - top, len(nodes)))
+    allowed = (target > least) & (target < end[:, None])
     _require(bool(allowed[slots.inner].all()), "a child is none of the nodes that it may be")
     of_top, of_rest = target[slots.inner & is_top], target[slots.inner & ~is_top]
-    _require(np.array_equal(np.sort(of_top), np.arange(1, top)), "a top node has not one parent")
+    below = np.setdiff1d(np.arange(top), roots.tops[:-1])
+    _require(np.array_equal(np.sort(of_top), below), "a top node has not one parent")
     first = top + blocks if complete else top
     _require(np.array_equal(np.sort(of_rest), np.arange(first, len(nodes))), "a node has not one parent")
-    block = (nodes[:, 1:2] + ranks)[slots.leaf & is_top]
-    _require(top == 0 or np.array_equal(np.sort(block), np.arange(blocks)), "a block has not one parent")
+    _check_blocks(nodes[:top, 1:2] + ranks[:top], slots.leaf[:top], roots)
     child = np.where(slots.inner, target, EMPTY)
     if not complete:
         return np.where(slots.leaf, -(nodes[:, 1:2] + ranks + 1), child).astype(np.int32)
     child = np.where(slots.leaf & is_top, top + nodes[:, 1:2] + ranks, child)
     run = _linked_runs(packed, slots, child, blocks)
     return np.where(slots.leaf & ~is_top, -(run + 1), child).astype(np.int32)
+
+
+def _check_blocks(block: np.ndarray, is_leaf: np.ndarray, roots: Roots) -> None:
+    """Each block of a geometry of several is the leaf of one slot of that geometry's nodes."""
+    several = np.diff(roots.blocks) > 1
+    wanted = np.flatnonzero(np.repeat(several, np.diff(roots.blocks)))
+    _require(np.array_equal(np.sort(block[is_leaf]), wanted), "a block has not one parent")
+    geometry = np.repeat(np.arange(len(several)), np.diff(roots.tops))[:, None]
+    own = (block >= roots.blocks[geometry]) & (block < roots.blocks[geometry + 1])
+    _require(bool(own[is_leaf].all()), "a block has not one parent")
 
 
 def _linked_runs(packed: PackedNodes, slots: _Slots, child: np.ndarray, blocks: int) -> np.ndarray:

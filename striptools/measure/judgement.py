@@ -27,6 +27,7 @@ from striptools.measure.oracle import Candidates, Oracle, OracleHits
 from striptools.measure.ray_sets import RaySet
 from striptools.measure.structure import least_first
 from striptools.mesh.clean import weld_vertices
+from striptools.reducem.placed import Placed
 from striptools.reducem.scene import Scene
 from striptools.trace.hit import Hits
 
@@ -82,10 +83,12 @@ class Judge:
         oracle: Of the source, with the scene's error bound.
         surface: Of the source's faces that the scene holds.
         surface_face: (n,) int32, the source face of each face of `surface`.
-        scene: What was traced.
+        scene: What was traced, its instances where they stand.
     """
 
-    def __init__(self, oracle: Oracle, surface: Surface, surface_face: np.ndarray, scene: Scene) -> None:
+    def __init__(
+        self, oracle: Oracle, surface: Surface, surface_face: np.ndarray, scene: Scene | Placed
+    ) -> None:
         self.oracle = oracle
         self.surface = surface
         self.scene = scene

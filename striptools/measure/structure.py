@@ -20,6 +20,7 @@ import numpy as np
 
 from striptools.mesh.clean import clean, weld_vertices
 from striptools.mesh.mesh import Mesh
+from striptools.reducem.placed import Placed
 from striptools.reducem.scene import Remap, Scene
 
 SLACK = 1 + 2.0**-20
@@ -52,9 +53,15 @@ class Structure:
         return self.missing + self.unexpected + self.wrong
 
 
-def compare_structure(scene: Scene, source: Mesh) -> Structure:
-    """Compare a scene with the mesh it was made from; the module's head says how."""
-    kept = clean(source).source_face
+def compare_structure(scene: Scene | Placed, source: Mesh, kept: np.ndarray | None = None) -> Structure:
+    """Compare a scene with the mesh it was made from; the module's head says how.
+
+    Args:
+        scene: The scene, or its triangles where its instances stand.
+        source: What it was made from, instances in their places too.
+        kept: (k,) int32, the faces of the source that cleaning keeps; None to clean it for them.
+    """
+    kept = clean(source).source_face if kept is None else kept
     if scene.remap is not None:
         return _compare_by_remap(scene, scene.remap, source, kept)
     if scene.error_bound == 0:
@@ -73,7 +80,7 @@ def corner_distance(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     return np.linalg.norm(ours.astype(np.float64) - theirs, axis=2).max(axis=1, initial=0)
 
 
-def _compare_by_remap(scene: Scene, remap: Remap, source: Mesh, kept: np.ndarray) -> Structure:
+def _compare_by_remap(scene: Scene | Placed, remap: Remap, source: Mesh, kept: np.ndarray) -> Structure:
     known = (remap.face >= 0) & (remap.face < source.triangle_count)
     face = np.where(known, remap.face, 0)
     seen = np.bincount(face[known], minlength=source.triangle_count)
@@ -132,7 +139,7 @@ def _row_keys(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows.astype(np.int32)).view("V12").reshape(-1)
 
 
-def _compare_as_sets(scene: Scene, source: Mesh, kept: np.ndarray) -> Structure:
+def _compare_as_sets(scene: Scene | Placed, source: Mesh, kept: np.ndarray) -> Structure:
     leader, _ = weld_vertices(np.concatenate([rounded_positions(source), scene.positions]))
     theirs = least_first(leader[source.faces[kept]])
     ours = least_first(leader[scene.faces() + source.vertex_count])
@@ -150,7 +157,7 @@ def _compare_as_sets(scene: Scene, source: Mesh, kept: np.ndarray) -> Structure:
     return Structure(len(kept), len(ours), missing - excused, int(-excess[excess < 0].sum()), 0, excused)
 
 
-def _compare_places(scene: Scene, source: Mesh, kept: np.ndarray) -> Structure:
+def _compare_places(scene: Scene | Placed, source: Mesh, kept: np.ndarray) -> Structure:
     from scipy.spatial import KDTree
 
     used = np.unique(source.faces[kept])

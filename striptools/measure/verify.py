@@ -19,6 +19,7 @@ from striptools.measure.ray_sets import RaySet, aimed_sets, camera_set, inside_s
 from striptools.measure.structure import Structure, compare_structure, rounded_positions
 from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
+from striptools.reducem.placed import Placed
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.trace.hit import Hits
@@ -186,7 +187,8 @@ def verify(
 
     Args:
         scene: The scene.
-        source: The mesh it was made from, as loaded: not cleaned.
+        source: The mesh it was made from, as loaded: not cleaned. For a scene with instances also with
+            them; flattened, its faces that vanish where an instance stands are taken for missing.
         options: How much is traced.
         tracer: What traces the scene; a `striptools.trace.Tracer` of it when None.
         watch: Called with "structure" or "rays" and the fraction done.
@@ -194,38 +196,60 @@ def verify(
     Raises:
         UsageError: The source has another number of faces than the one that the scene was made from.
     """
-    if scene.remap is not None and scene.source_face_count != source.triangle_count:
-        raise UsageError(
-            f"the source has {source.triangle_count} faces, the scene's had {scene.source_face_count}",
-            remedy="give the file that was converted",
-        )
+    placed = scene.placed()
+    source, kept = _where_it_stands(scene, placed, source)
     if scene.origin is not None:
         # Rays and answers are in the frame about the origin; so is the source from here on.
         source = replace(source, positions=source.positions - scene.origin)
     tell = watch or (lambda stage, fraction: None)
     tell("structure", 0.0)
-    structure = compare_structure(scene, source)
-    oracle = Oracle(source, scene.error_bound)
-    surface_face = _traced_faces(scene, source)
+    structure = compare_structure(placed, source, kept)
+    oracle = Oracle(source, placed.error_bound)
+    surface_face = _traced_faces(placed, source, kept)
     surface = Surface(rounded_positions(source), source.faces[surface_face])
     tell("structure", 1.0)
     if tracer is None:
         from striptools.trace import Tracer
 
         tracer = Tracer(scene)
-    judge = Judge(oracle, surface, surface_face, scene)
+    judge = Judge(oracle, surface, surface_face, placed)
     tried = min(options.rays, options.pair_budget // (4 * max(1, source.triangle_count)))
     runner = _Runner(judge, tracer, tell, 4 * tried)
     sets = _run_sets(runner, options, tried)
     return VerifyReport(
-        tuple(sets), structure, options.rays, tried, scene.error_bound, surface.closed, surface.open_edges
+        tuple(sets), structure, options.rays, tried, placed.error_bound, surface.closed, surface.open_edges
     )
 
 
-def _traced_faces(scene: Scene, source: Mesh) -> np.ndarray:
+def _where_it_stands(scene: Scene, placed: Scene | Placed, source: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The source with its instances in their places, and the faces there that cleaning keeps, (k,) int32.
+
+    What a scene with instances has cleaned, and rounded to float32, are the geometries before they stand.
+    """
+    apart = scene.instances is not None and source.instances is not None
+    source = source if apart else source.flattened()
+    expected = scene.source_face_count if apart else placed.source_face_count
+    more = placed is not scene and not apart and source.triangle_count > expected
+    fits = source.triangle_count == expected or more
+    if scene.remap is not None and not fits:
+        raise UsageError(
+            f"the source has {source.triangle_count} faces, the scene's had {expected}",
+            remedy="give the file that was converted",
+        )
+    kept = clean(source).source_face
+    if not apart or source.instances is None or source.geometries is None:
+        return source, kept
+    is_kept = np.zeros(source.triangle_count, np.bool_)
+    is_kept[kept] = True
+    there = [is_kept[source.geometries.faces(geometry)] for geometry, _ in source.instances]
+    flat = replace(source, positions=rounded_positions(source)).flattened()
+    return flat, np.flatnonzero(np.concatenate(there)).astype(np.int32)
+
+
+def _traced_faces(scene: Scene | Placed, source: Mesh, kept: np.ndarray) -> np.ndarray:
     """The source faces that the scene holds; all that cleaning keeps where it does not say."""
     if scene.remap is None:
-        return clean(source).source_face
+        return kept
     there = np.zeros(source.triangle_count, bool)
     face = scene.remap.face
     there[face[(face >= 0) & (face < source.triangle_count)]] = True

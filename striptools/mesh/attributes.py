@@ -295,7 +295,9 @@ def turn_normals(values: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     cofactors = np.stack([np.cross(matrix[(k + 1) % 3], matrix[(k + 2) % 3]) for k in range(3)])
     with np.errstate(all="ignore"):
         sign = -1.0 if np.linalg.det(matrix) < 0 else 1.0
-        turned = values.astype(np.float64) @ (sign * cofactors).T
+        x, y, z = values.astype(np.float64).T
+        rows = sign * cofactors
+        turned = np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in rows], axis=1)
         length = np.sqrt((turned * turned).sum(axis=1, keepdims=True))
         return np.where(length > 0, turned / length, turned).astype(np.float32)
 

@@ -28,13 +28,15 @@ doubtful faces, float64 once more where every difference and product is exact in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from striptools.errors import UsageError
-from striptools.mesh.attributes import follow
+from striptools.mesh.attributes import Attribute, Domain, follow
+from striptools.mesh.instances import Geometries
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import Origin, recentred
 from striptools.threads import in_chunks, in_parts
@@ -113,13 +115,17 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS, threads: int = 1)
     """Round, weld and drop as the module's head says; the mesh may come out empty, and its counts say why.
 
     The result is the same for any number of threads. What needs no change is not copied: the cleaned mesh may
-    share arrays with `mesh`.
+    share arrays with `mesh`. Geometries are cleaned each by itself, where they do not stand anywhere yet, and
+    never recentred; one may come out empty.
 
     Raises:
         UsageError: Where `options` are out of range.
     """
     from striptools.kernels.degenerate import USABLE
 
+    if mesh.geometries is not None:
+        own = replace(options, recentre="never")
+        return _joined(mesh, [clean(part, own, threads) for part in mesh.parts()])
     positions, largest_rounding = round_positions(mesh.positions)
     origin = None
     if largest_rounding > 0 and options.recentre == "auto":
@@ -157,6 +163,53 @@ def clean(mesh: Mesh, options: CleanOptions = DEFAULT_OPTIONS, threads: int = 1)
     positions = positions if vertices_out == len(positions) else positions[used]
     cleaned = Mesh(positions, kept_faces, mesh.notes, attributes, mesh.materials, mesh.unit)
     return Cleaned(cleaned, source_face, counts, largest_rounding, weld_error, origin)
+
+
+def _joined(mesh: Mesh, parts: list[Cleaned]) -> Cleaned:
+    """The geometries of a mesh, each cleaned, as one mesh again."""
+    assert mesh.geometries is not None
+    starts = Geometries(
+        *(
+            np.cumsum([0, *counts], dtype=np.int32)
+            for counts in ([len(c.mesh.faces) for c in parts], [len(c.mesh.positions) for c in parts])
+        )
+    )
+    source = [
+        part.source_face + first for part, first in zip(parts, mesh.geometries.face_starts, strict=False)
+    ]
+    joined = replace(
+        mesh,
+        positions=np.concatenate([part.mesh.positions for part in parts]),
+        faces=np.concatenate(
+            [part.mesh.faces + first for part, first in zip(parts, starts.vertex_starts, strict=False)]
+        ),
+        attributes=_joined_attributes([part.mesh for part in parts]),
+        geometries=starts,
+    )
+    counts = sum((Counter(part.counts) for part in parts), Counter())
+    return Cleaned(
+        joined,
+        np.concatenate(source).astype(np.int32),
+        {name: counts[name] for name in parts[0].counts},
+        max(part.largest_rounding for part in parts),
+        max(part.weld_error for part in parts),
+    )
+
+
+def _joined_attributes(parts: list[Mesh]) -> tuple[Attribute, ...]:
+    """The attributes of meshes one after another, of corners where some are and others are not."""
+    found = []
+    for k, first in enumerate(parts[0].attributes):
+        own = [(part.attributes[k], part.faces) for part in parts]
+        domains: set[Domain] = {one.domain for one, faces in own if len(faces)}
+        domain = domains.pop() if len(domains) == 1 else "corner" if domains else first.domain
+        rows = [
+            one.values if one.domain == domain else one.at_corners(faces)
+            for one, faces in own
+            if len(faces) or one.domain == domain
+        ]
+        found.append(Attribute(first.name, domain, np.concatenate(rows)))
+    return tuple(found)
 
 
 def round_positions(positions: SourcePositions) -> tuple[Positions, float]:

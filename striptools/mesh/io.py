@@ -34,17 +34,21 @@ WRITE_FORMATS = ("ply", "obj", "stl", "glb")
 MAGIC = {b"ply": "ply", b"glTF": "glb", b"OFF": "off", b"COFF": "off", b"solid": "stl", b"{": "gltf"}
 
 
-def load_mesh(source: str | Path | IO[bytes], *, file_format: str | None = None) -> Mesh:
+def load_mesh(
+    source: str | Path | IO[bytes], *, file_format: str | None = None, instances: bool = False
+) -> Mesh:
     """Read a mesh file.
 
     Scenes of several meshes or instances are flattened into one mesh with their transforms applied, and a
-    note says so. Positions are float32 where the file holds float32 (or text that float32 holds exactly),
-    else float64.
+    note says so, unless `instances` are to be kept. Positions are float32 where the file holds float32 (or
+    text that float32 holds exactly), else float64.
 
     Args:
         source: A path, or an open binary file such as `sys.stdin.buffer`.
         file_format: One of `READ_FORMATS` (or of `MESHLAB_FORMATS`) where the name or the first bytes do not
             tell.
+        instances: Keep meshes that a glTF scene has in several places as geometries with instances;
+            `Mesh.flattened` gives what is given without.
 
     Raises:
         UnreadableMeshError: Where it cannot be read, is malformed, or holds no triangle.
@@ -55,9 +59,9 @@ def load_mesh(source: str | Path | IO[bytes], *, file_format: str | None = None)
     where = str(path) if path else str(getattr(source, "name", "the input stream"))
     try:
         if path is None:
-            return _load_stream(source, where, file_format)  # pyright: ignore[reportArgumentType]
+            return _load_stream(source, where, file_format, instances)  # pyright: ignore[reportArgumentType]
         with path.open("rb") as file:
-            return _load_file(file, path, file_format)
+            return _load_file(file, path, file_format, instances)
     except StriptoolsError as error:
         raise type(error)(error.what, where=error.where or where, remedy=error.remedy) from error
     except MemoryError as error:
@@ -79,8 +83,9 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
 
     Positions are written as float32, bit for bit where they are float32; PLY and OBJ hold float64 too where
     they are that. STL has no shared vertices. Attributes are written where the format can hold them, vertices
-    split where it must be: `unkept` says what it cannot. An OBJ file with materials gets a file of its name
-    and .mtl beside it, where `target` is a path.
+    split where it must be: `unkept` says what it cannot. GLB keeps instances, other formats are written
+    flattened. An OBJ file with materials gets a file of its name and .mtl beside it, where `target` is a
+    path.
 
     Args:
         mesh: What to write.
@@ -101,13 +106,15 @@ def save_mesh(mesh: Mesh, target: str | Path | IO[bytes], *, file_format: str | 
             f"no mesh format to write: {name or 'none given'}", remedy=f"one of {', '.join(WRITE_FORMATS)}"
         )
     library = _write_library(mesh, Path(target)) if is_path and name == "obj" else ""  # pyright: ignore[reportArgumentType]
-    data = _encode(mesh, name, library)
+    data = _encode(mesh if name == "glb" else mesh.flattened(), name, library)
     return write_atomically(target, data) if is_path else write_stream(target, data)
 
 
 def unkept(mesh: Mesh, file_format: str) -> tuple[str, ...]:
     """What `save_mesh` leaves out of a file of a format, in words for people; empty where it is nothing."""
     words = [one.plural for one in mesh.attributes if not _is_kept(one, file_format)]
+    if mesh.instances is not None and file_format != "glb":
+        words.insert(0, "instances, each written in full")
     if file_format == "glb" and any(one.group for one in mesh.materials):
         words.append("names of groups")
     if file_format in ("stl", "glb") and (mesh.positions.astype(np.float32) != mesh.positions).any():
@@ -141,22 +148,24 @@ def _encode(mesh: Mesh, name: str, library: str) -> bytes:
         return encode_obj(mesh, library)
     if name == "ply" and (mesh.attributes or mesh.positions.dtype == np.float64):
         return encode_ply(mesh)
-    if name == "glb" and mesh.attributes:
+    if name == "glb" and (mesh.attributes or mesh.instances is not None):
         return encode_glb(mesh)
     return _encode_through_trimesh(mesh, name)
 
 
-def _load_stream(stream: IO[bytes], where: str, file_format: str | None) -> Mesh:
+def _load_stream(stream: IO[bytes], where: str, file_format: str | None, instances: bool) -> Mesh:
     data = stream.read()
-    return _finish(_read(BytesIO(data), Path(where), None, _choose_format(data[:512], "", file_format)))
+    name = _choose_format(data[:512], "", file_format)
+    return _finish(_read(BytesIO(data), Path(where), None, name, instances))
 
 
-def _load_file(file: IO[bytes], path: Path, file_format: str | None) -> Mesh:
+def _load_file(file: IO[bytes], path: Path, file_format: str | None, instances: bool) -> Mesh:
     start = file.read(512)
     if not file.seekable():
-        return _load_stream(BytesIO(start + file.read()), str(path), file_format)
+        return _load_stream(BytesIO(start + file.read()), str(path), file_format, instances)
     file.seek(0)
-    return _finish(_read(file, path, path.parent, _choose_format(start, path.suffix, file_format)))
+    name = _choose_format(start, path.suffix, file_format)
+    return _finish(_read(file, path, path.parent, name, instances))
 
 
 def _choose_format(start: bytes, suffix: str, asked: str | None) -> str:
@@ -176,7 +185,7 @@ def _choose_format(start: bytes, suffix: str, asked: str | None) -> str:
     return shown
 
 
-def _read(file: IO[bytes], path: Path, folder: Path | None, name: str) -> Parsed:
+def _read(file: IO[bytes], path: Path, folder: Path | None, name: str, instances: bool) -> Parsed:
     from striptools.mesh.readers import gltf, meshlab, obj, off, ply, stl
 
     readers: dict[str, Callable[[], Parsed]] = {
@@ -184,8 +193,8 @@ def _read(file: IO[bytes], path: Path, folder: Path | None, name: str) -> Parsed
         "obj": lambda: obj.read_obj(file, folder),
         "stl": lambda: stl.read_stl(file),
         "off": lambda: off.read_off(file),
-        "glb": lambda: gltf.read_glb(file, folder),
-        "gltf": lambda: gltf.read_gltf(file, folder),
+        "glb": lambda: gltf.read_glb(file, folder, instances),
+        "gltf": lambda: gltf.read_gltf(file, folder, instances),
     }
     if name in readers:
         return readers[name]()
@@ -217,6 +226,8 @@ def _finish(parsed: Parsed) -> Mesh:
         parsed.attributes,
         parsed.materials,
         parsed.unit,
+        parsed.geometries,
+        parsed.instances,
     )
 
 

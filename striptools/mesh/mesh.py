@@ -10,6 +10,14 @@ import numpy as np
 
 from striptools.errors import LimitError, UsageError
 from striptools.mesh.attributes import NAMES, Attribute, Material, check_attributes
+from striptools.mesh.instances import (
+    Geometries,
+    Instances,
+    check_instances,
+    placed_attributes,
+    placed_faces,
+    placed_positions,
+)
 from striptools.types import Faces, SourcePositions
 
 if TYPE_CHECKING:
@@ -32,6 +40,9 @@ class Mesh:
             the order of `NAMES`.
         materials: What the numbers of the attribute `group` stand for.
         unit: The length that 1 stands for ("m", "mm", "in"), where the source says so.
+        geometries: Which faces and vertices are one geometry, where geometries stand in several places; None
+            for a plain mesh. No face has vertices of two.
+        instances: Where they stand, there where `geometries` are.
 
     Raises:
         UsageError: Where an array has another shape or dtype, or an index is out of range.
@@ -44,6 +55,8 @@ class Mesh:
     attributes: tuple[Attribute, ...] = ()
     materials: tuple[Material, ...] = ()
     unit: str | None = None
+    geometries: Geometries | None = None
+    instances: Instances | None = None
 
     def __post_init__(self) -> None:
         positions = _rows_of_three(self.positions, "positions")
@@ -66,6 +79,7 @@ class Mesh:
         object.__setattr__(self, "attributes", tuple(attributes))
         object.__setattr__(self, "materials", tuple(self.materials))
         check_attributes(self.attributes, self.materials, len(positions), len(faces))
+        check_instances(self.geometries, self.instances, len(positions), self.faces)
 
     def attribute(self, name: str) -> Attribute | None:
         """The attribute of a name, or None."""
@@ -87,6 +101,46 @@ class Mesh:
     def vertex_count(self) -> int:
         """How many vertices there are, whether a face uses them or not."""
         return len(self.positions)
+
+    def flattened(self) -> Mesh:
+        """The plain mesh of all instances, one after another; the mesh itself where it has none.
+
+        Positions are float64 where a matrix moves them, else as they are; a mirror turns the winding of its
+        faces, whose second and third corner change places; normals are turned and of length 1.
+
+        Raises:
+            LimitError: Where that has more than `MOST_FACES` faces.
+        """
+        if self.geometries is None or self.instances is None:
+            return self
+        given = (self.geometries, self.instances)
+        return replace(
+            self,
+            faces=placed_faces(self.faces, *given, MOST_FACES),
+            positions=placed_positions(self.positions, *given),
+            attributes=placed_attributes(self.attributes, *given),
+            geometries=None,
+            instances=None,
+        )
+
+    def parts(self) -> list[Mesh]:
+        """A plain mesh for each geometry, where it does not stand anywhere yet; the mesh itself if plain."""
+        if self.geometries is None:
+            return [self]
+        return [self._part(k) for k in range(len(self.geometries))]
+
+    def _part(self, geometry: int) -> Mesh:
+        assert self.geometries is not None
+        faces, vertices = self.geometries.faces(geometry), self.geometries.vertices(geometry)
+        rows = {"face": faces, "vertex": vertices, "corner": slice(3 * faces.start, 3 * faces.stop)}
+        return replace(
+            self,
+            positions=self.positions[vertices],
+            faces=self.faces[faces] - np.int32(vertices.start),
+            attributes=tuple(replace(one, values=one.values[rows[one.domain]]) for one in self.attributes),
+            geometries=None,
+            instances=None,
+        )
 
     @cached_property
     def bounds(self) -> np.ndarray:

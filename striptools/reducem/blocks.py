@@ -73,6 +73,11 @@ class Blocks:
             return 0
         return int(self.headers[-1, 0]) + int(self.headers[-1, 2] & 0xFF) + 1
 
+    @property
+    def triangle_starts(self) -> np.ndarray:
+        """(b+1,) int64, the first triangle of each block, then how many there are."""
+        return np.append(self.headers[:, 0].astype(np.int64), self.triangle_count)
+
     def totals(self) -> dict[str, int]:
         """Count over all blocks: `vertices`, `strips`, `connectivity_bits`, `position_bits`, `words`."""
         names = ("vertices", "strips", "connectivity_bits", "position_bits", "words")

@@ -12,6 +12,7 @@ from striptools.mesh.attributes import Domain
 from striptools.reducem import layout
 from striptools.reducem.attributes import check_columns
 from striptools.reducem.blocks import check_headers
+from striptools.reducem.geometries import check_faces, check_geometries, check_instance_rules
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene, bounds_of
 from striptools.types import FaceIds
@@ -82,6 +83,7 @@ def check_scene(scene: Scene, where: str = "scene") -> None:
     if scene.block_count:
         check_headers(scene.blocks, scene.triangle_count, where)
     _check_positions(scene, where)
+    check_placing(scene, where)
     check_nodes(scene, where)
     check_remap(scene.remap, scene.triangle_count, scene.source_face_count, where)
     _check_attributes(scene, where)
@@ -124,6 +126,26 @@ def check_origin(origin: list[float], there: bool, place: str) -> None:
         raise unreadable("RDM209", place)
 
 
+def check_placing(scene: Scene, where: str) -> None:
+    """Make sure that geometries and instances, where they are, keep their rules.
+
+    Raises:
+        UnreadableSceneError: They do not.
+    """
+    geometries, instances = scene.geometries, scene.instances
+    if geometries is None or instances is None:
+        if geometries is not None or instances is not None:
+            raise unreadable("RDM113", f"{where}: {'GEOM' if geometries is None else 'INST'}")
+        return
+    if scene.block_count == 0:
+        raise unreadable("RDM117", f"{where}: GEOM")
+    starts = (geometries, scene.roots, scene.blocks.triangle_starts)
+    check_geometries(*starts, scene.source_face_count, where)
+    check_instance_rules(instances, geometries, scene.low, scene.high, where)
+    if scene.remap is not None:
+        check_faces(*starts, scene.remap.face, where)
+
+
 def check_nodes(scene: Scene, where: str) -> None:
     """Make sure that the hierarchy reaches everything once and that its boxes hold what is below them.
 
@@ -134,7 +156,7 @@ def check_nodes(scene: Scene, where: str) -> None:
         if len(scene.packed.nodes) or scene.packed.runs is not None:
             raise unreadable("RDM208", f"{where}: SCEN")
         return
-    given = (scene.grid, scene.triangle_boxes(), scene.block_starts, scene.starts)
+    given = (scene.grid, scene.triangle_boxes(), scene.block_starts, scene.starts, scene.roots)
     try:
         check_packed(scene.packed, *given)
     except UnreadableSceneError as error:
@@ -188,6 +210,11 @@ def _check_dtypes(scene: Scene) -> None:
         ("high", scene.high, np.float32),
         ("origin", scene.origin, np.float64),
     ]
+    if scene.geometries is not None:
+        wanted.append(("geometries.rows", scene.geometries.rows, np.uint32))
+    if scene.instances is not None:
+        names = (("geometry", np.uint32), ("first_face", np.uint32), ("matrix", np.float64))
+        wanted += [(f"instances.{name}", getattr(scene.instances, name), kind) for name, kind in names]
     if scene.remap is not None:
         wanted += [
             ("remap.face", scene.remap.face, np.int32),

@@ -1,7 +1,8 @@
 """Every flaw of a scene file, by a code that users can cite; formats/reducem/ISSUES.md lists the same.
 
-Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 52 attributes, 53 materials, 6 blocks,
-7 nodes, 8 runs, 9 metadata. Those of 3 and 4 belonged to formats before 0.3 and are not used again.
+Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 52 attributes, 53 materials,
+54 geometries, 55 instances, 6 blocks, 7 nodes, 8 runs, 9 metadata. Those of 3 and 4 belonged to formats
+before 0.3 and are not used again.
 """
 
 import sys
@@ -108,6 +109,15 @@ _ALL = (
     _flaw("RDM528", "4.7", "a group has no material"),
     _flaw("RDM531", "4.8", "the materials are no JSON array of materials in UTF-8"),
     _flaw("RDM532", "4.8", "the materials are longer than 2^22 bytes"),
+    _flaw(
+        "RDM541", "4.10", "the blocks or top nodes of a geometry are none, too many, or out of their order"
+    ),
+    _flaw("RDM542", "4.10", "the source faces of a geometry are too few, out of their order, or not there"),
+    _flaw("RDM543", "4.10", "a triangle comes from a face of another geometry"),
+    _flaw("RDM551", "4.11", "an instance has no geometry, or a geometry no instance"),
+    _flaw("RDM552", "4.11", "a matrix is not finite, or its determinant is zero"),
+    _flaw("RDM553", "4.11", "an instance reaches too far for float32"),
+    _flaw("RDM554", "4.11", "the faces of an instance are out of their order, or too many"),
     _flaw("RDM601", "4.2", "a block does not begin at the triangle where the one before it ends"),
     _flaw("RDM602", "4.2", "the data of a block do not begin where those before them end"),
     _flaw("RDM603", "4.2", "a block has fewer than 3 vertices, or more strips than triangles"),

@@ -47,6 +47,7 @@ ZERO_WORDS = 16
 
 GRID_EXPONENTS = range(-149, 105)
 CELL_EXPONENTS = range(-149, 128)
+INSTANCE_LIMIT = 2**24
 METADATA_LIMIT = 2**20
 MATERIALS_LIMIT = 2**22
 ATTRIBUTES_HEAD = 8
@@ -193,19 +194,40 @@ ATTRIBUTE = _record(
     ("<u4", "rows"),
     ("<u4", "reserved"),
 )
-RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD, ATTRIBUTE)
+GEOMETRY = _record(
+    "geometry",
+    ("<u4", "first_block"),
+    ("<u4", "first_top"),
+    ("<u4", "first_face"),
+    ("<u4", "face_count"),
+)
+INSTANCE = _record(
+    "instance",
+    ("<u4", "geometry"),
+    ("<u4", "first_face"),
+    ("12<f8", "matrix"),
+)
+RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD, ATTRIBUTE, GEOMETRY, INSTANCE)
 
 SCENE = Section(b"SCEN", True)
 BLOCK_HEADERS = Section(b"BLKH", True)
 BLOCK_DATA = Section(b"BLKD", True)
 NODES = Section(b"NODE", True)
 RUNS = Section(b"RUNS", True)
+GEOMETRIES = Section(b"GEOM", True)
+INSTANCES = Section(b"INST", True)
 REMAP = Section(b"RMAP", False)
 ATTRIBUTES = Section(b"ATTR", False)
 MATERIALS = Section(b"MATL", False)
 METADATA = Section(b"META", False)
-SECTIONS = (SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, ATTRIBUTES, MATERIALS, METADATA)
+SECTIONS = (
+    *(SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, ATTRIBUTES, MATERIALS, METADATA),
+    *(GEOMETRIES, INSTANCES),
+)
 """In the order in which the writer puts them."""
+
+RAW = (SCENE, INSTANCES)
+"""Those that must not be packed: what bounds the length of others, and what no count bounds."""
 
 PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 2, REMAP.kind: 4}
 """Bytes of a record for the kinds of sections that may have the codec of planes."""
@@ -213,7 +235,7 @@ PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 2, REMAP.kind
 
 def codecs_of(section: Section) -> tuple[int, ...]:
     """The codecs that a section may have."""
-    if section is SCENE:
+    if section in RAW:
         return (CODEC_RAW,)
     if section is BLOCK_DATA:
         return (CODEC_RAW, CODEC_ZSTD, CODEC_BLOCKS)
@@ -228,9 +250,11 @@ PARTS = (
     "top_level",
     "remap",
     "attributes",
+    "instances",
     "container",
 )
-"""What the bytes of a file are counted by; container is header, table, scene record, metadata and padding."""
+"""What the bytes of a file are counted by; instances are geometries too; container is header, table, scene
+record, metadata and padding."""
 
 
 def aligned(length: int) -> int:
@@ -253,7 +277,8 @@ def section_lengths(
 ) -> dict[bytes, int]:
     """Say how long each section of a scene is, decoded, where its counts alone say so; 0 means left out.
 
-    Block data, attributes, materials, metadata, and whether there is a remap are not the counts' matter.
+    Block data, attributes, materials, metadata, geometries, instances, and whether there is a remap are not
+    the counts' matter.
     """
     return {
         SCENE.kind: SCENE_RECORD.size,

@@ -16,6 +16,7 @@ import numpy as np
 
 from striptools.errors import StriptoolsError, UsageError
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
+from striptools.mesh.instances import placed_bounds
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import Origin, displacement
 from striptools.reducem.layout import GRID_EXPONENTS
@@ -229,12 +230,21 @@ def recentred_bound(cleaned: Cleaned) -> float:
 
 
 def _exponent(mesh: Mesh, precision: PrecisionOptions, already: float) -> int:
-    bounds = mesh.bounds
+    """The grid that is asked for, finer by the largest stretch of instances, to hold where they stand."""
+    bounds, stretch = mesh.bounds, 1.0
+    if mesh.geometries is not None and mesh.instances is not None:
+        bounds = placed_bounds(mesh.positions, mesh.geometries, mesh.instances)
+        stretch = mesh.instances.stretch
     if precision.bits is not None:
-        return grid_exponent_for(bounds, precision.bits)
-    assert precision.max_error is not None
-    scale = float(np.linalg.norm(bounds[1] - bounds[0])) if precision.relative else 1.0
-    return exponent_for_error(bounds, precision.max_error * scale, already)
+        exponent = grid_exponent_for(bounds, precision.bits)
+    else:
+        assert precision.max_error is not None
+        scale = float(np.linalg.norm(bounds[1] - bounds[0])) if precision.relative else 1.0
+        exponent = exponent_for_error(bounds, precision.max_error * scale, already * stretch)
+    if stretch == 1.0:
+        return exponent
+    finer = math.frexp(stretch)[1]
+    return min(max(exponent - finer, GRID_EXPONENTS.start), GRID_EXPONENTS.stop - 1)
 
 
 def _count_flipped(mesh: Mesh, again: Cleaned) -> int:

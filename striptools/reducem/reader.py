@@ -27,6 +27,16 @@ from striptools.reducem import check, layout
 from striptools.reducem.archive import expanded, expanded_blocks
 from striptools.reducem.attributes import Column, check_columns, check_materials, decode_columns
 from striptools.reducem.blocks import Blocks, check_headers
+from striptools.reducem.geometries import (
+    SceneGeometries,
+    SceneInstances,
+    check_faces,
+    check_geometries,
+    check_instance_rules,
+    decode_geometries,
+    decode_instances,
+    roots_of,
+)
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene
 
@@ -177,6 +187,10 @@ class _File:
             return self.materials()
         if name == "metadata":
             return self.metadata()
+        if name == "geometries":
+            return self.geometries(scene)
+        if name == "instances":
+            return self.instances(scene)
         return self.of_record(name)
 
     def check(self, scene: Scene) -> None:
@@ -234,7 +248,7 @@ class _File:
         record = {field.name: row[field.name].tolist() for field in layout.SCENE_RECORD.fields}
         if record["triangle_count"] == 0 and raw[_BOUNDS].any():
             raise unreadable("RDM208", f"{self.where}: SCEN")
-        _check_record(record, f"{self.where}: SCEN")
+        _check_record(record, layout.GEOMETRIES.kind in self.entries, f"{self.where}: SCEN")
         if record["triangle_count"] > MOST_TRIANGLES or record["source_face_count"] > 2**31 - 1:
             raise unreadable("RDM124", f"{self.where}: SCEN")
         return record
@@ -338,6 +352,43 @@ class _File:
         check.check_metadata(metadata, self.where)
         return metadata
 
+    def geometries(self, scene: Scene) -> SceneGeometries | None:
+        """The geometries, checked."""
+        size, record = layout.GEOMETRY.size, self.record
+        raw = self.section(layout.GEOMETRIES, 0, size * record["block_count"])
+        self.check_both()
+        if not len(raw):
+            return None
+        if len(raw) % size:
+            raise unreadable("RDM114", f"{self.where}: GEOM")
+        geometries = decode_geometries(raw)
+        roots = roots_of(geometries, record["block_count"], record["top_count"])
+        starts = scene.blocks.triangle_starts
+        check_geometries(geometries, roots, starts, record["source_face_count"], self.where)
+        if scene.remap is not None:
+            check_faces(geometries, roots, starts, scene.remap.face, self.where)
+        return geometries
+
+    def instances(self, scene: Scene) -> SceneInstances | None:
+        """The instances, checked."""
+        size = layout.INSTANCE.size
+        most = size * layout.INSTANCE_LIMIT if self.record["triangle_count"] else 0
+        raw = self.section(layout.INSTANCES, 0, most)
+        geometries = scene.geometries
+        if geometries is None:
+            return None
+        if len(raw) % size:
+            raise unreadable("RDM114", f"{self.where}: INST")
+        instances = decode_instances(raw)
+        check_instance_rules(instances, geometries, scene.low, scene.high, self.where)
+        return instances
+
+    def check_both(self) -> None:
+        """Make sure that geometries and instances are both there, or neither is."""
+        there = [section.kind in self.entries for section in (layout.GEOMETRIES, layout.INSTANCES)]
+        if any(there) and not all(there):
+            raise unreadable("RDM113", f"{self.where}: {'INST' if there[0] else 'GEOM'}")
+
     def json(self, raw: np.ndarray, kind: str, malformed: str, deep: str) -> Any:
         """The JSON of a section; `malformed` and `deep` are the codes of what may be wrong with it."""
         place = f"{self.where}: {kind}"
@@ -415,7 +466,7 @@ _BOUNDS = slice(40, 70)
 _KNOWN = {section.kind: section for section in layout.SECTIONS}
 
 
-def _check_record(record: dict[str, Any], place: str) -> None:
+def _check_record(record: dict[str, Any], has_geometries: bool, place: str) -> None:
     """Make sure that the counts agree with each other; the numbers are looked at with the scene's fields."""
     names = ("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count")
     n, b, m, top, r, faces = (record[name] for name in names)
@@ -430,7 +481,8 @@ def _check_record(record: dict[str, Any], place: str) -> None:
     nodes = m >= top + b if stored else m == top
     counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b
     runs = b <= r <= n if stored else r == 0
-    if not (counts and m <= layout.NODE_LIMIT and nodes and (top == 0) == (b < 2) and runs and faces >= n):
+    tops = top == 0 if b < 2 else top > 0 or has_geometries
+    if not (counts and m <= layout.NODE_LIMIT and nodes and tops and runs and faces >= n):
         raise unreadable("RDM201", place)
     if not record["flags"] & layout.ON_GRID and record["grid_exponent"]:
         raise unreadable("RDM203", place)

@@ -3,23 +3,29 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from striptools.hierarchies.packed import BoxGrid, PackedNodes, box_grid, build_inner
+from striptools.hierarchies.packed import BoxGrid, PackedNodes, Roots, box_grid, build_inner
 from striptools.mesh.attributes import Attribute, Material, follow
 from striptools.mesh.clean import weld_vertices
+from striptools.mesh.instances import Geometries, Instances
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import Origin
 from striptools.partition.boxes import face_boxes
 from striptools.reducem.attributes import Column, columns_of
 from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, encode_blocks
+from striptools.reducem.geometries import SceneGeometries, SceneInstances, roots_of
 from striptools.reducem.layout import LONGEST_RUN
 from striptools.strips.topology import Strips, decode_strips
 from striptools.threads import every_core, in_chunks
 from striptools.types import Bools, Boxes, Counts, FaceIds, Faces, Positions, Rotations
+
+if TYPE_CHECKING:
+    from striptools.reducem.placed import Placed
 
 __all__ = ["BoxesKind", "Remap", "Scene", "empty_scene", "scene_from_strips"]
 
@@ -63,6 +69,11 @@ class Scene:
         materials: What the numbers of the attribute `group` stand for.
         origin: (3,) float64: what to add to positions, bounds and boxes to be where the source is; None where
             they stand as they are. It is there for float64 sources alone that float32 would not hold well.
+            Where there are instances it is that of the frame that they stand in.
+        geometries: Where geometries stand in several places: which blocks, nodes over blocks and source
+            faces each is. Positions, bounds, boxes and `error_bound` are then in the geometries' own frames,
+            before any matrix, and so are `faces`, `triangle_count` and all else here that is not placed.
+        instances: Where they stand; there where `geometries` are.
     """
 
     blocks: Blocks
@@ -78,6 +89,8 @@ class Scene:
     columns: tuple[Column, ...] = field(default_factory=tuple)
     materials: tuple[Material, ...] = field(default_factory=tuple)
     origin: Origin | None = field(default_factory=lambda: None)
+    geometries: SceneGeometries | None = field(default_factory=lambda: None)
+    instances: SceneInstances | None = field(default_factory=lambda: None)
 
     @classmethod
     def lazily(cls, load: Callable[[str, "Scene"], object], check: Callable[["Scene"], None]) -> "Scene":
@@ -187,8 +200,40 @@ class Scene:
 
     @cached_property
     def leaders(self) -> Counts:
-        """(q,) int32, for each vertex the first one that equals it bit for bit."""
-        return weld_vertices(self.positions, threads=every_core())[0]
+        """(q,) int32, for each vertex the first one of its geometry that equals it bit for bit."""
+        leaders = [
+            weld_vertices(self.positions[first:end], threads=every_core())[0] + first
+            for first, end in pairwise(self.spans.vertex_starts)
+        ]
+        return np.concatenate(leaders) if len(leaders) > 1 else leaders[0]
+
+    @property
+    def roots(self) -> Roots:
+        """Which blocks and nodes over blocks each geometry has; a scene without them is one."""
+        return roots_of(self.geometries, self.block_count, self.packed.top_count)
+
+    @cached_property
+    def spans(self) -> Geometries:
+        """Which triangles, in file order, and which of `positions` each geometry has."""
+        blocks = self.roots.blocks
+        return Geometries(self.block_starts[blocks], self.decoded.vertex_starts[blocks].astype(np.int32))
+
+    @property
+    def placed_count(self) -> int:
+        """Triangles of all instances."""
+        if self.instances is None:
+            return self.triangle_count
+        return int(np.diff(self.spans.face_starts).astype(np.int64)[self.instances.geometry].sum())
+
+    def placed(self) -> "Scene | Placed":
+        """The triangles with every instance where it stands, computed on each call; the scene if plain.
+
+        Raises:
+            LimitError: Where they are more than a mesh may have.
+        """
+        from striptools.reducem.placed import place_scene
+
+        return self if self.instances is None else place_scene(self)
 
     def triangle_boxes(self, threads: int | None = None) -> Boxes:
         """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
@@ -228,7 +273,8 @@ class Scene:
             Vertices that are equal bit for bit are one again, in the order of their first block. With a
             remap, the faces in the source's order, each from the source's first corner; without one, in
             file order from the decoded first corner. Attributes, materials and unit as they were. Positions
-            are float64, where the source is, where there is an origin, else float32.
+            are float64, where the source is, where there is an origin, else float32. Geometries and instances
+            as they were, but for those of which cleaning left nothing.
         """
         faces, attributes = self.faces(), self.attributes
         order = np.arange(len(faces), dtype=np.int32)
@@ -242,10 +288,37 @@ class Scene:
         place = np.cumsum(is_leader, dtype=np.int32) - np.int32(1)
         welded = np.ascontiguousarray(place[leader[faces[order]]])
         attributes, _ = follow(attributes, faces, order, welded, np.flatnonzero(is_leader))
-        positions = self.positions[is_leader]
-        if self.origin is not None:
+        positions, geometries, instances = self.positions[is_leader], None, None
+        if self.instances is not None:
+            vertices = np.append(np.int32(0), np.cumsum(is_leader, dtype=np.int32))[self.spans.vertex_starts]
+            geometries, instances = Geometries(self.spans.face_starts, vertices), self._at_origin()
+        elif self.origin is not None:
             positions = positions.astype(np.float64) + self.origin
-        return Mesh(positions, welded, (), attributes, self.materials, self.unit)
+        given = (attributes, self.materials, self.unit, geometries, instances)
+        return Mesh(positions, welded, (), *given)
+
+    def _at_origin(self) -> Instances:
+        """The instances where the source is."""
+        assert self.instances is not None
+        matrix = self.instances.matrix.copy()
+        if self.origin is not None:
+            matrix[:, :, 3] += self.origin
+        return Instances(self.instances.geometry.astype(np.int32), matrix)
+
+    def flattened(self) -> Mesh:
+        """Give the mesh back with every instance where it stands.
+
+        Returns:
+            `to_mesh().flattened()`, but that positions are float32 where there is no origin: of a lossless
+            scene those of its source, flattened and rounded.
+
+        Raises:
+            LimitError: Where that has more faces than a mesh may have.
+        """
+        mesh = self.to_mesh().flattened()
+        if self.origin is not None:
+            return mesh
+        return replace(mesh, positions=mesh.positions.astype(np.float32))
 
     def save(self, target: str | Path | IO[bytes], *, archive: bool = False) -> int:
         """Write a scene file; the same scene gives the same bytes.
@@ -272,9 +345,9 @@ class Scene:
 
         Returns:
             Bytes of `positions`, `connectivity` (start, turn and flip bits, and indices),
-            `in_block_hierarchy`, `block_headers`, `top_level`, `remap`, `attributes` (materials too) and
-            `container` (header, table, scene record, metadata, and what fills up words and sections); their
-            sum is the file's length.
+            `in_block_hierarchy`, `block_headers`, `top_level`, `remap`, `attributes` (materials too),
+            `instances` (geometries too) and `container` (header, table, scene record, metadata, and what
+            fills up words and sections); their sum is the file's length.
         """
         from striptools.reducem.writer import part_sizes
 
@@ -329,6 +402,8 @@ def scene_from_strips(
     error_bound: float = 0.0,
     metadata: dict[str, Any] | None = None,
     origin: Origin | None = None,
+    geometries: SceneGeometries | None = None,
+    instances: SceneInstances | None = None,
     threads: int = 1,
 ) -> Scene:
     """Put a scene together from strips in blocks; the boxes inside blocks are to be rebuilt.
@@ -344,6 +419,8 @@ def scene_from_strips(
         error_bound: See `Scene`.
         metadata: See `Scene`.
         origin: See `Scene`.
+        geometries: See `Scene`.
+        instances: See `Scene`.
         threads: How many threads share the work; the scene is the same for any number.
 
     Raises:
@@ -364,6 +441,8 @@ def scene_from_strips(
         remap=None if source_face is None else _remap(source_face, strips, threads),
         metadata=dict(metadata or {}),
         origin=origin,
+        geometries=geometries,
+        instances=instances,
     )
 
 

@@ -20,14 +20,16 @@ from striptools.reducem.issues import ISSUES, Finding
 from striptools.reducem.validate_archive import content_limit, join_blocks, join_planes
 from striptools.reducem.validate_attributes import inspect_attributes, inspect_materials
 from striptools.reducem.validate_blocks import Blocks, inspect_blocks, inspect_headers
+from striptools.reducem.validate_instances import inspect_geometries, inspect_instances, inspect_owners
 from striptools.reducem.validate_nodes import inspect_nodes
 from striptools.reducem.validate_packed import unpack
 
 __all__ = ["validate"]
 
-_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
-_OPTIONAL = ("RMAP", "ATTR", "MATL", "META")
-_KNOWN = (*_NEEDED, *_OPTIONAL)
+_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
+_PASSED_OVER = ("RMAP", "ATTR", "MATL", "META")
+_KNOWN = (*_NEEDED, *_PASSED_OVER)
+_OPTIONAL = (*_PASSED_OVER, "GEOM", "INST")
 _WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 2, "RMAP": 4}
 """Bytes of a record for the kinds that may have codec 3."""
 _MOST_METADATA = 2**20
@@ -172,8 +174,10 @@ def _entry(inspection: Inspection, entry: _Entry) -> None:
 
 def _codec_fits(entry: _Entry) -> bool:
     """Whether the codec is one that the kind may have; a kind that is not known may have any."""
-    if entry.kind not in _KNOWN or entry.codec <= 1:
+    if entry.kind not in _KNOWN or entry.codec == 0:
         return True
+    if entry.codec == 1:
+        return entry.kind != "INST"
     return entry.kind == "BLKD" if entry.codec == 2 else entry.kind in _WIDTHS
 
 
@@ -211,6 +215,7 @@ def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str
     lengths |= {"NODE": (64 * m, 64 * m), "RUNS": (runs, runs)}
     lengths |= {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
     beside = {"ATTR": (1, 256 * (n + 1)), "MATL": (1, _MOST_MATERIALS)}
+    beside |= {"GEOM": (16, 16 * b), "INST": (104, 104 * 2**24)}
     return lengths | (beside if n else dict.fromkeys(beside, (0, 0)))
 
 
@@ -275,12 +280,16 @@ def _contents(inspection: Inspection) -> bool:
     """Look into the sections, each where it and what it leans on are whole."""
     sections = inspection.sections
     _record(inspection, sections["SCEN"])
+    parts = inspect_geometries(inspection)
     if "BLKH" in sections:
         geometry = inspect_blocks(inspection) if "BLKD" in sections else None
-        if "NODE" in sections:
-            inspect_nodes(inspection, geometry)
+        if "NODE" in sections and parts is not None:
+            inspect_nodes(inspection, geometry, parts)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])
+        inspect_owners(inspection, parts)
+    if "INST" in sections:
+        inspect_instances(inspection)
     _beside(inspection)
     if "META" in sections:
         _metadata(inspection, sections["META"])
@@ -304,14 +313,14 @@ def _record(inspection: Inspection, section: Section) -> None:
     n, b, m, top, r, source_faces, flags, reserved, grid = struct.unpack_from("<6IBBh", section.data)
     reserved_2 = section.data[28:32] != bytes(4)
     *cells, longest = struct.unpack_from("<3hH", section.data, 64)
-    stored = flags & 1
+    stored, several = flags & 1, "GEOM" in inspection.sections or "GEOM" in inspection.undecoded
     for at, wrong in ((24, flags > 7), (25, reserved), (28, reserved_2)):
         if wrong:
             inspection.found("RDM107", "SCEN", section.at(at))
     counts = (
         (4, b > 2**24 or (b == 0) != (n == 0) or not b <= n <= 256 * b),
         (8, m > 2**28 or (m < top + b if stored else m != top)),
-        (12, (top == 0) != (b < 2)),
+        (12, top > 0 if b < 2 else top == 0 and not several),
         (16, not b <= r <= n if stored else r),
         (20, source_faces < n),
     )

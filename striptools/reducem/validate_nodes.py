@@ -10,6 +10,7 @@ import numpy as np
 
 from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.validate_blocks import Geometry
+from striptools.reducem.validate_instances import Parts
 
 __all__ = ["inspect_nodes"]
 
@@ -45,6 +46,7 @@ class _Nodes:
     rows: np.ndarray
     top: int
     blocks: int
+    parts: Parts
     is_inner: np.ndarray
     is_leaf: np.ndarray
     is_box: np.ndarray
@@ -55,8 +57,13 @@ class _Nodes:
     def is_top(self) -> np.ndarray:
         return np.arange(len(self.rows)) < self.top
 
+    @property
+    def firsts(self) -> np.ndarray:
+        """The roots among the nodes over blocks, one for each geometry that has any."""
+        return self.parts.tops[:-1][np.diff(self.parts.tops) > 0]
 
-def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
+
+def inspect_nodes(inspection: Inspection, geometry: Geometry | None, parts: Parts) -> None:
     """Look at runs, where boxes are stored, and at nodes; without sound blocks, at what nodes name."""
     record = inspection.sections["SCEN"].data
     blocks, count, top, run_count = (int(x) for x in np.frombuffer(record, "<u4", 4, 4))
@@ -67,7 +74,7 @@ def inspect_nodes(inspection: Inspection, geometry: Geometry | None) -> None:
     if stored and geometry is not None and "RUNS" in inspection.sections:
         longest = int.from_bytes(record[70:72], "little")
         runs = _runs(inspection, geometry, run_count, longest)
-    nodes = _slots(inspection, top, blocks)
+    nodes = _slots(inspection, top, blocks, parts)
     parents = _parents(inspection, nodes)
     sound = _blocks(inspection, nodes)
     if runs is not None and parents is not None:
@@ -117,7 +124,7 @@ def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) 
     return _Runs(starts, block, first, length, whole=not wrong)
 
 
-def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
+def _slots(inspection: Inspection, top: int, blocks: int, parts: Parts) -> _Nodes:
     """Look at each node by itself."""
     section = inspection.sections["NODE"]
     rows = np.frombuffer(section.data, _NODE)
@@ -137,7 +144,7 @@ def _slots(inspection: Inspection, top: int, blocks: int) -> _Nodes:
     child = base[:, None] + np.cumsum(is_inner, axis=1) - 1
     first = np.where(np.arange(len(rows)) < top, leaves, leaves >> 24)
     leaf = first[:, None] + np.cumsum(is_leaf, axis=1) - 1
-    return _Nodes(section, rows, top, blocks, is_inner, is_leaf, ~is_empty & ~inverted, child, leaf)
+    return _Nodes(section, rows, top, blocks, parts, is_inner, is_leaf, ~is_empty & ~inverted, child, leaf)
 
 
 def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
@@ -145,7 +152,8 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
     m, roots = len(nodes.rows), np.arange(nodes.top, min(nodes.top + nodes.blocks, len(nodes.rows)))
     number = np.arange(m)[:, None]
     least = np.where(nodes.is_top[:, None], number + 1, np.maximum(number + 1, nodes.top + nodes.blocks))
-    most = np.where(nodes.is_top[:, None], nodes.top, m)
+    ends = np.repeat(nodes.parts.tops[1:], np.diff(nodes.parts.tops))
+    most = np.append(ends, np.full(m - nodes.top, m))[:, None]
     outside = nodes.is_inner & ((nodes.child < least) | (nodes.child >= most))
     at = nodes.section.at
     wrong = inspection.found_where(
@@ -154,7 +162,7 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
     parent, slot = np.nonzero(nodes.is_inner & ~outside)
     child = nodes.child[parent, slot]
     wanted = np.ones(m, np.int64)
-    wanted[[0]] = 0
+    wanted[nodes.firsts] = 0
     wanted[roots] = 0
     times = np.bincount(child, minlength=m)
     wrong |= inspection.found_where(
@@ -168,20 +176,23 @@ def _parents(inspection: Inspection, nodes: _Nodes) -> np.ndarray | None:
 
 
 def _blocks(inspection: Inspection, nodes: _Nodes) -> bool:
-    """Look whether each block is the leaf of one slot of the nodes over blocks."""
+    """Look whether each block is the leaf of one slot of the nodes over blocks of its geometry."""
     if nodes.top == 0:
         return True
     node, slot = np.nonzero(nodes.is_leaf & nodes.is_top[:, None])
     block = nodes.leaf[node, slot]
-    outside = block >= nodes.blocks
+    blocks, tops = nodes.parts
+    owner = np.repeat(np.arange(len(tops) - 1), np.diff(tops))[node]
+    outside = (block < blocks[owner]) | (block >= blocks[owner + 1])
     at = nodes.section.at
     if inspection.found_where(
         "RDM703", outside, lambda i: f"NODE: node {node[i]}", lambda i: at(64 * node[i] + 4)
     ):
         return False
+    wanted = np.repeat(np.diff(tops) > 0, np.diff(blocks))
     times = np.bincount(block, minlength=nodes.blocks)
     return not inspection.found_where(
-        "RDM703", times != 1, lambda i: f"NODE: block {i}", lambda i: nodes.section.offset
+        "RDM703", times != wanted, lambda i: f"NODE: block {i}", lambda i: nodes.section.offset
     )
 
 

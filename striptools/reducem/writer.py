@@ -17,6 +17,7 @@ from striptools.reducem import layout
 from striptools.reducem.archive import packed, packed_blocks
 from striptools.reducem.attributes import encode_columns, encode_materials, section_length
 from striptools.reducem.check import check_scene
+from striptools.reducem.geometries import encode_geometries, encode_instances
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene
 
@@ -42,7 +43,7 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
     Args:
         scene: The scene; every rule of the format is checked first.
         target: A path, written whole or not at all, or a binary stream.
-        archive: Pack every section but the scene record where that makes it smaller.
+        archive: Pack every section but scene record and instances where that makes it smaller.
 
     Returns:
         Bytes written.
@@ -79,6 +80,7 @@ def part_sizes(scene: Scene) -> dict[str, int]:
     parts["in_block_hierarchy"] = lengths[layout.NODES.kind] - parts["top_level"] + lengths[layout.RUNS.kind]
     parts["remap"] = lengths[layout.REMAP.kind]
     parts["attributes"] = lengths[layout.ATTRIBUTES.kind] + lengths[layout.MATERIALS.kind]
+    parts["instances"] = lengths[layout.GEOMETRIES.kind] + lengths[layout.INSTANCES.kind]
     present = [length for length in lengths.values() if length]
     total = _table_end(len(present)) + sum(map(layout.aligned, present))
     parts["container"] = total - sum(parts.values())
@@ -99,6 +101,9 @@ def _lengths(scene: Scene) -> dict[bytes, int]:
     lengths[layout.ATTRIBUTES.kind] = section_length(scene.columns)
     lengths[layout.MATERIALS.kind] = len(encode_materials(scene.materials))
     lengths[layout.METADATA.kind] = len(_metadata(scene.metadata))
+    for section, items in ((layout.GEOMETRIES, scene.geometries), (layout.INSTANCES, scene.instances)):
+        record = layout.GEOMETRY if section is layout.GEOMETRIES else layout.INSTANCE
+        lengths[section.kind] = 0 if items is None else record.size * len(items)
     if scene.remap is None:
         lengths[layout.REMAP.kind] = 0
     return lengths
@@ -131,13 +136,15 @@ def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
         (layout.ATTRIBUTES, encode_columns(scene.columns)),
         (layout.MATERIALS, encode_materials(scene.materials)),
         (layout.METADATA, _metadata(scene.metadata)),
+        (layout.GEOMETRIES, encode_geometries(scene.geometries)),
+        (layout.INSTANCES, encode_instances(scene.instances)),
     ]
 
 
 def _stored(scene: Scene, section: layout.Section, payload: Payload, archive: bool) -> _Stored:
     checksum = zlib.crc32(payload)
     plain = _Stored(section, layout.CODEC_RAW, len(payload), checksum, payload)
-    if not archive or section is layout.SCENE:
+    if not archive or section in layout.RAW:
         return plain
     if section is layout.BLOCK_DATA:
         codec, stored = packed_blocks(scene.blocks, scene.decoded)

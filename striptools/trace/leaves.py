@@ -18,6 +18,7 @@ from striptools.trace.walk import DONE, NO_NAME, Frame
 from striptools.trace.walk_wide import WideScene
 
 if TYPE_CHECKING:
+    from striptools.reducem.placed import Placed
     from striptools.reducem.scene import Scene
 
 CACHE_LINE = 64
@@ -72,7 +73,7 @@ def lay_out(scene: "Scene", threads: int = 1) -> Layout:
     return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
-def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
+def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
     boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
@@ -80,7 +81,9 @@ def lay_out_rebuilt(scene: "Scene", threads: int = 1) -> Layout:
     return lay_out_wide(scene, collapse(tree), split.order)
 
 
-def lay_out_wide(scene: "Scene", wide: WideTree, order: Int32[np.ndarray, " n"] | None = None) -> Layout:
+def lay_out_wide(
+    scene: "Scene | Placed", wide: WideTree, order: Int32[np.ndarray, " n"] | None = None
+) -> Layout:
     """Lay a scene out for the walk through any wide hierarchy over its triangles.
 
     Args:
@@ -118,7 +121,7 @@ def lay_out_wide(scene: "Scene", wide: WideTree, order: Int32[np.ndarray, " n"] 
     return Layout(WideScene(nodes, blocks, frame), place, triangle_of, wide.depth)
 
 
-def _names(scene: "Scene", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
+def _names(scene: "Scene | Placed", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:
     """The face that a hit on each triangle is reported as, and how its corners are turned."""
     if scene.remap is None:
         return np.arange(count, dtype=np.int32), np.zeros(count, np.uint8)
@@ -137,7 +140,7 @@ def _nodes(wide: WideTree, scale: np.float32) -> np.ndarray:
     return nodes
 
 
-def scale_of(scene: "Scene") -> np.float32:
+def scale_of(scene: "Scene | Placed") -> np.float32:
     """The power of two that brings the largest coordinate to 1 to 2.
 
     Scaling by it is exact, and the model's unit no longer matters.
@@ -149,12 +152,12 @@ def scale_of(scene: "Scene") -> np.float32:
     return np.float32(2.0 ** -min(max(exponent, -126), 126))
 
 
-def reach_of(scene: "Scene", scale: np.float32) -> np.float32:
+def reach_of(scene: "Scene | Placed", scale: np.float32) -> np.float32:
     """The largest scaled coordinate."""
     return np.float32(_largest(scene) * float(scale))
 
 
-def _largest(scene: "Scene") -> float:
+def _largest(scene: "Scene | Placed") -> float:
     """The largest coordinate."""
     return float(np.abs([scene.low, scene.high]).max())
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from striptools.errors import LimitError, MissingExtraError, UsageError
 from striptools.mesh.atomic import write_atomically, write_stream
+from striptools.reducem.placed import Placed
 from striptools.reducem.scene import Scene
 from striptools.trace.hit import Hits
 from striptools.trace.rays import Camera, camera_rays
@@ -86,7 +87,7 @@ def render(
     Args:
         tracer: A `striptools.trace.Tracer` of the scene.
         scene: The scene, for its normals and strips.
-        camera: Where from; `Camera.framing(scene.positions)` shows it whole.
+        camera: Where from; `Camera.framing(scene.placed().positions)` shows it whole.
         options: Shading and samples.
 
     Returns:
@@ -98,6 +99,7 @@ def render(
     count = camera.width * camera.height * options.samples**2
     if count > MOST_SAMPLES:
         raise LimitError(f"a picture of {count} samples", remedy=f"at most {MOST_SAMPLES} are drawn")
+    placed = scene.placed()
     origins, directions = camera_rays(camera, options.samples)
     hits = tracer.closest_hit(origins, directions, steps=options.shading == "steps")
     if options.shading == "steps":
@@ -105,7 +107,7 @@ def render(
     else:
         colours = _background(camera, options)
         hit = np.flatnonzero(hits.triangle >= 0)
-        colours[hit] = _surface_colours(scene, camera, options.shading, directions[hit], hits, hit)
+        colours[hit] = _surface_colours(placed, camera, options.shading, directions[hit], hits, hit)
     pixels = colours.reshape(camera.height, camera.width, options.samples**2, 3).mean(axis=2)
     return np.rint(_to_srgb(pixels) * 255).astype(np.uint8)
 
@@ -137,7 +139,12 @@ def _background(camera: Camera, options: RenderOptions) -> np.ndarray:
 
 
 def _surface_colours(
-    scene: Scene, camera: Camera, shading: Shading, directions: np.ndarray, hits: Hits, hit: np.ndarray
+    scene: Scene | Placed,
+    camera: Camera,
+    shading: Shading,
+    directions: np.ndarray,
+    hits: Hits,
+    hit: np.ndarray,
 ) -> np.ndarray:
     """(k, 3) linear colours of the rays that hit."""
     if shading == "depth":
@@ -153,7 +160,7 @@ def _surface_colours(
     return _to_linear(0.52 + 0.30 * seen + 0.12) * light
 
 
-def _facing_normals(scene: Scene, triangle: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _facing_normals(scene: Scene | Placed, triangle: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Unit normals of triangles in file order, on the side that the rays come from."""
     a, b, c = scene.positions[scene.faces()[triangle]].astype(np.float64).transpose(1, 0, 2)
     size = np.maximum(np.abs(b - a).max(axis=1), np.abs(c - a).max(axis=1))[:, None]

@@ -39,6 +39,10 @@ class Tracer:
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
 
+    Instances are traced where they stand, every one expanded: a scene with instances takes the memory of its
+    flattened triangles, and `hierarchy` is then always rebuilt. A hit's face is that of the flattened source
+    (`Mesh.flattened` of the mesh that was converted), its triangle one of `scene.placed()`.
+
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
 
@@ -56,7 +60,9 @@ class Tracer:
             that is free on the device, or on this machine where the device does not tell.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or not both of them together.
+        UsageError: There is no such device, hierarchy or residency, or not both of them together, or the scene
+            has instances, which are not traced compressed yet.
+        LimitError: All instances have more triangles than a mesh may have.
     """
 
     def __init__(
@@ -74,6 +80,8 @@ class Tracer:
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         self._on_gpu = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
+        if scene.instances is not None:
+            resident, hierarchy = _of_instances(resident), "rebuilt"
         if resident == "auto":
             budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
             fits = hierarchy == "rebuilt" or EXPANDED_BYTES * scene.triangle_count <= budget
@@ -86,7 +94,9 @@ class Tracer:
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
         if self._resident == "compressed":
             return lay_out_packed(scene, threads)
-        return lay_out(scene, threads) if hierarchy == "stored" else lay_out_rebuilt(scene, threads)
+        if hierarchy == "stored":
+            return lay_out(scene, threads)
+        return lay_out_rebuilt(scene.placed(), threads)
 
     def _builders(self, threads: int | None) -> int:
         """Threads to build with: as many as trace on a CPU; beside a GPU, two unless one was asked for."""
@@ -194,6 +204,17 @@ def _check_kinds(hierarchy: str, resident: str) -> None:
         raise UsageError(
             "a rebuilt hierarchy is expanded", where="resident", remedy="use the stored hierarchy"
         )
+
+
+def _of_instances(resident: ResidentKind) -> ResidentKind:
+    """How a scene with instances is kept."""
+    if resident == "compressed":
+        raise UsageError(
+            "a scene with instances is not traced compressed yet",
+            where="resident",
+            remedy="use expanded, or convert it with its instances flattened",
+        )
+    return "expanded"
 
 
 def checked_rays(

@@ -15,11 +15,12 @@ import struct
 import sys
 import zlib
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
 MUST_UNDERSTAND = {"SCEN": 1, "BLKH": 1, "BLKD": 1, "NODE": 1, "RUNS": 1}
-MUST_UNDERSTAND |= {"RMAP": 0, "ATTR": 0, "MATL": 0, "META": 0}
+MUST_UNDERSTAND |= {"GEOM": 1, "INST": 1, "RMAP": 0, "ATTR": 0, "MATL": 0, "META": 0}
 MOST_DEEP = 32
 """Levels of arrays and objects in metadata."""
 
@@ -61,6 +62,10 @@ class Scene:
             f32 are 32-bit patterns.
         materials: The array of MATL; empty where there is none.
         metadata: The object of META; empty where there is none.
+        geometries: For each `(first_block, first_top, first_face, face_count)`; one that has all where there
+            is no GEOM.
+        instances: For each `(geometry, first_face, matrix)`, the matrix twelve floats; None where there are
+            none.
         passed_over: The kinds of sections that this reader does not know.
     """
 
@@ -75,6 +80,8 @@ class Scene:
     attributes: dict = field(default_factory=dict)
     materials: list = field(default_factory=list)
     metadata: dict = field(default_factory=dict)
+    geometries: list = field(default_factory=list)
+    instances: list | None = None
     passed_over: list = field(default_factory=list)
 
 
@@ -90,17 +97,22 @@ def read(data):
     sections, passed_over = read_container(bytes(data))
     if "SCEN" not in sections:
         raise RefusedError("4", "there is no section SCEN")
-    record = read_record(sections["SCEN"])
+    record = read_record(sections["SCEN"], "GEOM" in sections)
     check_lengths(record, sections)
     scene = Scene(record, passed_over=passed_over)
     read_blocks(scene, sections.get("BLKH", b""), sections.get("BLKD", b""))
     check_bounds(scene)
+    scene.geometries = read_geometries(scene, sections.get("GEOM", bytes(12) + struct.pack("<I", 2**32 - 1)))
+    if "GEOM" in sections:
+        check_geometries(scene)
+        scene.instances = read_instances(scene, sections["INST"])
     if record["stored"]:
         scene.runs = read_runs(scene, sections["RUNS"])
     scene.nodes = [read_node(scene, i, sections["NODE"]) for i in range(record["node_count"])]
     check_nodes(scene)
     if "RMAP" in sections:
         scene.remap = read_remap(record, sections["RMAP"])
+        check_owners(scene)
     if "MATL" in sections:
         scene.materials = read_materials(sections["MATL"])
     if "ATTR" in sections:
@@ -198,7 +210,7 @@ FIELDS = (
 )
 
 
-def read_record(payload):
+def read_record(payload, several):
     """The fields of SCEN by name, with `stored` and `grid` for the two flags, and `low`, `high`, `cell`."""
     if len(payload) != RECORD.size:
         raise RefusedError("4.1", f"SCEN has {len(payload)} bytes")
@@ -220,18 +232,18 @@ def read_record(payload):
         raise RefusedError("4.1", "the grid exponent is out of its range")
     if not all(-149 <= cell <= 127 for cell in record["cell"]):
         raise RefusedError("4.1", "a cell exponent is out of its range")
-    check_counts(record)
+    check_counts(record, several)
     if record["triangle_count"] == 0:
         check_empty(record, payload)
     return record
 
 
-def check_counts(record):
-    """Refuse counts that no scene can have."""
+def check_counts(record, several):
+    """Refuse counts that no scene can have; `several` says whether it has GEOM."""
     n, b, m = record["triangle_count"], record["block_count"], record["node_count"]
     top, r, longest = record["top_count"], record["run_count"], record["longest_run"]
     wrong = b > 2**24 or m > 2**28 or (b == 0) != (n == 0) or not b <= n <= 256 * b
-    wrong = wrong or record["source_face_count"] < n or (top == 0) != (b < 2)
+    wrong = wrong or record["source_face_count"] < n or (top > 0 if b < 2 else top == 0 and not several)
     if record["stored"]:
         wrong = wrong or m < top + b or not b <= r <= n or not 1 <= longest <= 8
     else:
@@ -259,6 +271,8 @@ def check_lengths(record, sections):
             raise RefusedError("4", f"{kind} is there and not needed")
     if ("BLKD" in sections) != (n > 0):
         raise RefusedError("4", "BLKD is missing, or there and not needed")
+    if ("GEOM" in sections) != ("INST" in sections) or (n == 0 and "GEOM" in sections):
+        raise RefusedError("4", "of GEOM and INST one is missing, or they are there and not needed")
 
 
 # Sections 4.2 and 4.3: blocks
@@ -484,7 +498,7 @@ def read_node(scene, number, payload):
 def check_nodes(scene):
     """Refuse nodes that do not reach each node, block and run once."""
     top, b = scene.record["top_count"], scene.record["block_count"]
-    parents = {}
+    parents, owners, several = {}, *top_owners(scene)
     home = {top + i: i for i in range(b)}
     for number, node in enumerate(scene.nodes):
         for child in node.children:
@@ -493,17 +507,31 @@ def check_nodes(scene):
             if child in parents:
                 raise RefusedError("4.4", f"node {number}: {child} has two parents")
             parents[child] = number
+            if number < top and owners.get(child) != owners[("node", number)]:
+                raise RefusedError("4.10", f"node {number}: has a child of another geometry")
             if child[0] == "node" and not number < child[1] < (top if number < top else len(scene.nodes)):
                 raise RefusedError("4.4", f"node {number}: an inner child is not where it must be")
             if child[0] == "node" and number >= top:
                 home[child[1]] = home.get(number)
             if child[0] == "run" and child[1] != home.get(number):
                 raise RefusedError("4.4", f"node {number}: is not a node of block {child[1]}")
-    wanted = {("node", i) for i in range(1, top)} | {("node", i) for i in range(top + b, len(scene.nodes))}
-    wanted |= {("block", i) for i in range(b if top else 0)}
+    wanted = {("node", i) for i in range(top + b, len(scene.nodes))} | several
     wanted |= {("run", i, j) for i, runs in enumerate(scene.runs or []) for j in range(len(runs))}
     if set(parents) != wanted:
         raise RefusedError("4.4", "a node, block or run has no parent, or should have none")
+
+
+def top_owners(scene):
+    """The geometry of each node over blocks and of each block, and those of them that must have a parent."""
+    owners, several = {}, set()
+    ends = [row[:2] for row in scene.geometries[1:]]
+    ends.append((scene.record["block_count"], scene.record["top_count"]))
+    for i, ((block, top, *_), (next_block, next_top)) in enumerate(zip(scene.geometries, ends, strict=True)):
+        owners |= {("node", j): i for j in range(top, next_top)}
+        owners |= {("block", j): i for j in range(block, next_block)}
+        several |= {("node", j) for j in range(top + 1, next_top)}
+        several |= {("block", j) for j in range(block, next_block if next_top > top else block)}
+    return owners, several
 
 
 # Section 4.6: the remap
@@ -612,6 +640,112 @@ def read_materials(payload):
     return materials
 
 
+# Sections 4.10 and 4.11: geometries and instances
+
+
+def read_geometries(scene, payload):
+    """The records of GEOM."""
+    if len(payload) % 16 or not len(payload) <= 16 * max(1, scene.record["block_count"]):
+        raise RefusedError("4.10", "no whole number of geometries, or more than blocks")
+    return list(struct.iter_unpack("<4I", payload))
+
+
+def check_geometries(scene):
+    """Refuse geometries that do not share out blocks, nodes over blocks and source faces."""
+    rows, record = scene.geometries, scene.record
+    ends = [*rows[1:], (record["block_count"], record["top_count"], record["source_face_count"], 0)]
+    if rows[0][:2] != (0, 0):
+        raise RefusedError("4.10", "the first geometry does not begin at block 0 and node 0")
+    for i, (row, end) in enumerate(zip(rows, ends, strict=True)):
+        blocks, tops = end[0] - row[0], end[1] - row[1]
+        if blocks < 1 or tops < 0 or (tops > 0) != (blocks > 1):
+            raise RefusedError("4.10", f"geometry {i} has {blocks} blocks and {tops} nodes over them")
+        triangles = scene.block_starts[end[0]] - scene.block_starts[row[0]]
+        if row[2] + row[3] > end[2] or row[3] < triangles:
+            raise RefusedError("4.10", f"geometry {i}: its source faces are too few or not there")
+
+
+def check_owners(scene):
+    """Refuse triangles that come from source faces of another geometry."""
+    first_blocks = [row[0] for row in scene.geometries[1:]] + [scene.record["block_count"]]
+    begin = 0
+    for (_, _, first, count), end in zip(scene.geometries, first_blocks, strict=True):
+        faces = [face for face, _ in scene.remap[begin : scene.block_starts[end]]]
+        if any(not first <= face < first + count for face in faces):
+            raise RefusedError("4.10", "a triangle comes from a face of another geometry")
+        begin = scene.block_starts[end]
+
+
+def read_instances(scene, payload):
+    """For each instance its geometry, its first face and its matrix."""
+    if len(payload) % 104 or len(payload) > 104 * 2**24:
+        raise RefusedError("4.11", "no whole number of instances, or too many")
+    rows = [(row[0], row[1], row[2:]) for row in struct.iter_unpack("<2I12d", payload)]
+    if {geometry for geometry, _, _ in rows} != set(range(len(scene.geometries))):
+        raise RefusedError("4.11", "an instance without a geometry, or a geometry without an instance")
+    least = 0
+    for i, (geometry, first_face, matrix) in enumerate(rows):
+        check_matrix(scene, i, matrix)
+        if first_face < least:
+            raise RefusedError("4.11", f"instance {i}: its faces are not behind those before")
+        least = first_face + scene.geometries[geometry][3]
+    if least > 2**32 - 1:
+        raise RefusedError("4.11", "the instances have too many faces")
+    return rows
+
+
+def check_matrix(scene, number, matrix):
+    """Refuse a matrix that is not finite, flattens, or reaches too far."""
+    if not all(map(math.isfinite, matrix)):
+        raise RefusedError("4.11", f"instance {number}: its matrix is not finite")
+    if determinant(matrix) == 0:
+        raise RefusedError("4.11", f"instance {number}: the determinant of its matrix is zero")
+    low, high = scene.record["low"], scene.record["high"]
+    x, y, z = (max(abs(low[axis]), abs(high[axis])) for axis in range(3))
+    for row in (matrix[:4], matrix[4:8], matrix[8:]):
+        a, b, c, d = map(abs, row)
+        if not ((a * x + b * y) + c * z) + d <= 2.0**127:
+            raise RefusedError("4.11", f"instance {number}: reaches too far")
+
+
+def determinant(matrix):
+    """The determinant of the first three columns, exactly."""
+    a, b, c, _, d, e, f, _, g, h, i, _ = map(Fraction, matrix)
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def is_identity(matrix):
+    """Whether a matrix leaves everything as it is."""
+    return tuple(matrix) == (1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
+
+
+def place(vertex, matrix):
+    """Where a vertex, three 32-bit patterns, stands by a matrix: three of them again."""
+    if is_identity(matrix):
+        return vertex
+    x, y, z = map(as_float, vertex)
+    rows = (matrix[:4], matrix[4:8], matrix[8:])
+    moved = [((a * x + b * y) + c * z) + d for a, b, c, d in rows]
+    return tuple(int.from_bytes(struct.pack("<f", value), "little") for value in moved)
+
+
+def placed(scene):
+    """The vertices and faces of all instances one after another, and the number of each face."""
+    vertices, faces, numbers = [], [], []
+    ends = [row[0] for row in scene.geometries[1:]] + [scene.record["block_count"]]
+    for geometry, first_face, matrix in scene.instances:
+        first_block, _, first, _ = scene.geometries[geometry]
+        begin, end = scene.block_starts[first_block], scene.block_starts[ends[geometry]]
+        used = sorted({corner for face in scene.faces[begin:end] for corner in face})
+        number = {corner: len(vertices) + i for i, corner in enumerate(used)}
+        vertices += [place(scene.vertices[corner], matrix) for corner in used]
+        for t in range(begin, end):
+            a, b, c = (number[corner] for corner in scene.faces[t])
+            faces.append([a, c, b] if determinant(matrix) < 0 else [a, b, c])
+            numbers.append(first_face + scene.remap[t][0] - first if scene.remap else None)
+    return vertices, faces, numbers
+
+
 # Section 4.9: metadata
 
 
@@ -685,6 +819,8 @@ def summary(scene):
         "grid": f"2^{record['grid_exponent']}" if record["grid"] else "none",
         "origin": [record[f"origin_{axis}"] for axis in "xyz"] if record["flags"] & 4 else "none",
         "remap": "yes" if scene.remap else "no",
+        "geometries": len(scene.geometries),
+        "instances": "none" if scene.instances is None else len(scene.instances),
         "attributes": ", ".join(scene.attributes) or "none",
         "materials": ascii(scene.materials),
         "metadata": ascii(scene.metadata),
@@ -694,9 +830,10 @@ def summary(scene):
 
 
 def wavefront(scene):
-    """The text of a Wavefront OBJ; nine digits give a float32 back."""
-    lines = ["v " + " ".join(f"{as_float(bits):.9g}" for bits in vertex) for vertex in scene.vertices]
-    lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in scene.faces]
+    """The text of a Wavefront OBJ, instances where they stand; nine digits give a float32 back."""
+    vertices, faces = (scene.vertices, scene.faces) if scene.instances is None else placed(scene)[:2]
+    lines = ["v " + " ".join(f"{as_float(bits):.9g}" for bits in vertex) for vertex in vertices]
+    lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in faces]
     return "".join(f"{line}\n" for line in lines)
 
 

@@ -23,6 +23,7 @@ from make import (
     f32,
     fold,
     place,
+    plain_nodes,
     planes,
     streams,
 )
@@ -127,7 +128,7 @@ def valid_plans() -> dict[str, tuple[str, Plan]]:
     }
     for group in (_turns(), _limits(), _widths(), _exponents(), _floats(), _boxes(), _containers(), _sides()):
         made |= group
-    for group in (_attributes(), _origins()):
+    for group in (_attributes(), _origins(), _instances()):
         made |= group
     return made
 
@@ -476,6 +477,58 @@ def _sides() -> dict[str, tuple[str, Plan]]:
 # Invalid ones
 
 
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+MIRROR = (-1.0, 0.0, 0.0, 9.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+SHEAR = (2.0, 0.5, 0.0, 0.1, 0.0, 0.25, 0.0, -7.0, 0.0, 1.0, 3.0, 1e-300)
+
+
+def _placed(**changes) -> Plan:
+    """Two geometries, of two blocks and of one, in three instances."""
+    blocks = blocks_of(3)
+    given = {
+        "nodes": plain_nodes(blocks[:2], None),
+        "top": 1,
+        "remap": [(0, 0), (1, 1), (3, 2), (2, 0), (5, 0), (6, 1)],
+        "geometries": [(0, 0, 0, 4), (2, 1, 5, 2)],
+        "instances": [(1, 0, IDENTITY), (0, 2, MIRROR), (1, 7, SHEAR)],
+        "record": {"source_face_count": 8},
+    }
+    return Plan(blocks, **(given | changes))
+
+
+def _instances() -> dict[str, tuple[str, Plan]]:
+    blocks = blocks_of(4)
+    low, high = Slot(False, (0, 0, 0), (255, 255, 255)), Slot(False, (0, 0, 0), (40, 9, 9))
+    roots = [Node([high], leaves=i) for i in range(4)]
+    stored = Plan(
+        blocks,
+        stored=True,
+        nodes=[Node([low, high]), Node([low, high], leaves=2), *roots],
+        top=2,
+        geometries=[(0, 0, 0, 4), (2, 1, 4, 4)],
+        instances=[(0, 0, MIRROR), (1, 100, SHEAR), (0, 104, IDENTITY), (0, 2**32 - 5, MIRROR)],
+    )
+    least = (5e-324, 0.0, 0.0, 0.0, 0.0, 5e-324, 0.0, 0.0, 0.0, 0.0, 5e-324, 0.0)
+    far = (*IDENTITY[:3], 2.0**126, 2.0**124, *IDENTITY[5:])
+    singles = Plan(
+        blocks_of(2),
+        nodes=[],
+        top=0,
+        geometries=[(0, 0, 0, 2), (1, 0, 2, 2)],
+        instances=[(0, 0, IDENTITY), (1, 2, least), (0, 4, far)],
+    )
+    one = Plan([TRIANGLE], geometries=[(0, 0, 0, 1)], instances=[(0, 0, IDENTITY)])
+    return {
+        "instances": (
+            "two geometries in three instances, a mirror, a shear, source faces left out",
+            _placed(),
+        ),
+        "instances_stored": ("two trees over blocks and stored boxes", stored),
+        "instances_of_blocks": ("geometries of one block, the least and the farthest matrix", singles),
+        "instances_one": ("one geometry that stands where it is, no remap", one),
+    }
+
+
 def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
     """The invalid files by name, with what is wrong and the codes of the issues that a validator finds."""
     made: dict[str, tuple[str, list[str], bytes]] = {}
@@ -490,6 +543,8 @@ def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
         _packed(),
         _values(),
         _materials(),
+        _geometries(),
+        _matrices(),
         _streams(),
     ):
         made |= group
@@ -1062,6 +1117,76 @@ def _values() -> dict[str, tuple[str, list[str], bytes]]:
         "groups_beyond": of("a group without a material", "RDM528", GROUPS, materials=[RED]),
         "groups_huge": of("a group of 2^31", "RDM528", GROUPS._replace(rows=[(1,), (2**31,)]), **two),
         "groups_alone": of("groups and no materials", "RDM113", GROUPS),
+    }
+
+
+def _geometries() -> dict[str, tuple[str, list[str], bytes]]:
+    def of(about: str, codes: str, *rows: tuple[int, int, int, int]) -> tuple[str, list[str], bytes]:
+        return about, codes.split(), encode(_placed(geometries=list(rows)))
+
+    first, second = (0, 0, 0, 4), (2, 1, 5, 2)
+    empty = {"GEOM": lambda _: bytes(16), "INST": lambda _: bytes(104)}
+    foreign = [(0, 0), (1, 1), (5, 2), (2, 0), (3, 0), (6, 1)]
+    twins = Plan(
+        blocks_of(4),
+        nodes=[Node([Slot(False, (0, 0, 0), (40, 9, 9))] * 2, leaves=i) for i in (0, 1)],
+        top=2,
+        geometries=[(0, 0, 0, 4), (2, 1, 4, 4)],
+        instances=[(0, 0, IDENTITY), (1, 4, IDENTITY)],
+    )
+    inner = Slot(True, (0, 0, 0), (40, 9, 9))
+    across = [Node([Slot(False, (0, 0, 0), (40, 9, 9)), inner], base=1), Node(twins.nodes[1].slots, leaves=2)]
+    return {
+        "geometry_first_block": of("the first does not begin at block 0", "RDM541", (1, 0, 0, 4), second),
+        "geometry_first_top": of("the first does not begin at node 0", "RDM541", (0, 1, 0, 4), second),
+        "geometry_order": of("blocks out of their order", "RDM541", (0, 0, 0, 4), (0, 1, 5, 2)),
+        "geometry_beyond": of("blocks behind the last", "RDM541", first, (3, 1, 5, 2)),
+        "geometry_tops": of(
+            "a geometry of two blocks without a node over them", "RDM541", first, (2, 0, 5, 2)
+        ),
+        "geometry_tops_many": of("more nodes over blocks than there are", "RDM541", first, (2, 2, 5, 2)),
+        "geometry_faces_few": of("fewer source faces than triangles", "RDM542 RDM543", (0, 0, 0, 3), second),
+        "geometry_faces_shared": of("source faces of two geometries", "RDM542 RDM554", (0, 0, 0, 6), second),
+        "geometry_faces_beyond": of("source faces that are not there", "RDM542 RDM554", first, (2, 1, 5, 4)),
+        "geometry_foreign": wrong("a triangle of another's faces", "RDM543", _placed(), remap=foreign),
+        "geometry_cut": wrong("half a record", "RDM114", _placed(), payloads={"GEOM": lambda d: d[:-8]}),
+        "geometry_alone": wrong("no instances", "RDM113", _placed(), drop=("INST",)),
+        "geometry_none": wrong("no geometries", "RDM113 RDM703", _placed(), drop=("GEOM",)),
+        "geometry_many": wrong(
+            "more geometries than blocks", "RDM114", _placed(), payloads={"GEOM": lambda d: d + bytes(32)}
+        ),
+        "geometry_empty": wrong("of an empty scene", "RDM117", Plan([]), payloads=empty),
+        "geometry_flag": wrong("need not be understood", "RDM116", _placed(), entries={"GEOM": {"flags": 0}}),
+        "geometry_child": wrong(
+            "a node of another geometry as a child", "RDM701 RDM703", twins, nodes=across
+        ),
+        "geometry_block": wrong("a block of another geometry", "RDM703", twins),
+    }
+
+
+def _matrices() -> dict[str, tuple[str, list[str], bytes]]:
+    def of(about: str, codes: str, *rows: tuple[int, int, tuple]) -> tuple[str, list[str], bytes]:
+        return about, codes.split(), encode(_placed(instances=list(rows)))
+
+    def by(about: str, codes: str, matrix: tuple[float, ...]) -> tuple[str, list[str], bytes]:
+        return of(about, codes, (1, 0, IDENTITY), (0, 2, matrix))
+
+    inf, nan, huge = float("inf"), float("nan"), 1.5 * 2.0**126
+    flat = (0.1, 0.2, 0.3, 0.0, 0.2, 0.4, 0.6, 0.0, 0.0, 0.0, 1.0, 0.0)
+    packed = {"INST": frame}
+    return {
+        "instance_geometry": of("a geometry that is not there", "RDM551", (1, 0, IDENTITY), (2, 2, IDENTITY)),
+        "instance_none": of("a geometry without an instance", "RDM551", (1, 0, IDENTITY), (1, 2, MIRROR)),
+        "instance_nan": by("a matrix that is no number", "RDM552", (nan, *IDENTITY[1:])),
+        "instance_infinite": by("a place infinitely far", "RDM552", (*IDENTITY[:3], inf, *IDENTITY[4:])),
+        "instance_zero": by("a matrix of zeros", "RDM552", (0.0,) * 12),
+        "instance_flat": by("a matrix that flattens, by no power of two", "RDM552", flat),
+        "instance_far": by("too far a place", "RDM553", (*IDENTITY[:3], 1.01 * 2.0**127, *IDENTITY[4:])),
+        "instance_stretched": by("too much stretched", "RDM553", (huge, *IDENTITY[1:])),
+        "instance_order": of("faces that begin too early", "RDM554", (1, 0, IDENTITY), (0, 1, MIRROR)),
+        "instance_faces": of("too many faces", "RDM554", (1, 0, IDENTITY), (0, 2**32 - 4, MIRROR)),
+        "instance_cut": wrong("half a record", "RDM114", _placed(), payloads={"INST": lambda d: d[:-4]}),
+        "instance_packed": wrong("instances that are not raw", "RDM125", _placed(), packed=packed),
     }
 
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS")
-ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "ATTR", "MATL", "META")
+MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
+ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "ATTR", "MATL", "META", "GEOM", "INST")
 RECORD = {
     **dict.fromkeys(("triangle_count", "block_count", "node_count", "top_count", "run_count"), "I"),
     **{"source_face_count": "I", "flags": "B", "reserved": "B", "grid_exponent": "h", "reserved_2": "I"},
@@ -498,6 +498,9 @@ class Plan:
         remap: `(face, rotation)` of each triangle.
         attributes: The attributes, if any.
         materials: An array, or the bytes of MATL.
+        geometries: `(first_block, first_top, first_face, face_count)` of each, if any; nodes are to be given
+            with them.
+        instances: `(geometry, first_face, matrix)` of each, the matrix twelve numbers, if any.
         metadata: An object, or the bytes of META.
         grid: The grid exponent.
         cells: The exponents of the cells of plain nodes.
@@ -522,6 +525,8 @@ class Plan:
     remap: list[tuple[int, int]] | None = None
     attributes: list[Values] = field(default_factory=list)
     materials: list | bytes | None = None
+    geometries: list[tuple[int, int, int, int]] = field(default_factory=list)
+    instances: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
     metadata: dict | bytes | None = None
     grid: int | None = None
     cells: tuple[int, int, int] = (0, 0, 0)
@@ -625,7 +630,9 @@ def sections(plan: Plan) -> dict[str, bytes]:
         metadata = json.dumps(metadata, ensure_ascii=False).encode()
     nodes = b"".join(encode_node(node) for node in plan.nodes or [])
     made = (record(RECORD, scene_record(plan)), headers, data, nodes, runs, remap)
-    made += (attributes, materials, metadata)
+    geometries = b"".join(struct.pack("<4I", *row) for row in plan.geometries)
+    instances = b"".join(struct.pack("<2I12d", *row[:2], *row[2]) for row in plan.instances)
+    made += (attributes, materials, metadata, geometries, instances)
     return dict(zip(ORDER, made, strict=True))
 
 
@@ -657,7 +664,8 @@ def scene_record(plan: Plan) -> dict:
 def decoding(plan: Plan) -> dict:
     """What a reader makes of a valid plan: floats as the hexadecimal of their bits, x, y and z in a row.
 
-    Fields of the record that are not there are zero; no attributes and no materials are left out.
+    Fields of the record that are not there are zero; attributes, materials and instances are left out where
+    there are none.
     """
     first, faces, vertices = 0, [], []
     for block in plan.blocks:
@@ -682,6 +690,7 @@ def decoding(plan: Plan) -> dict:
         "packed": sorted(plan.packed),
         **({"attributes": decoded_attributes(plan.attributes)} if plan.attributes else {}),
         **({"materials": plan.materials} if plan.materials else {}),
+        **({"geometries": plan.geometries, "instances": plan.instances} if plan.instances else {}),
     }
 
 

@@ -15,7 +15,7 @@ import json
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +25,7 @@ import numpy as np
 
 from striptools.errors import LimitError, UnreadableMeshError
 from striptools.mesh.attributes import Attribute
+from striptools.mesh.instances import Geometries, Instances, determinant_signs, is_identity, place
 from striptools.mesh.mesh import MOST_FACES, first_face_out_of_range
 from striptools.mesh.readers.gltf_attributes import (
     material_number,
@@ -44,6 +45,12 @@ POINTS_AND_LINES = (0, 1, 2, 3)
 TRIANGLES, STRIP = 4, 5
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 IDENTITY = np.eye(4)
+
+Meshes = dict[int, list[Parsed]]
+"""The primitives of each mesh that has triangles."""
+
+Nodes = list[tuple[int, np.ndarray]]
+"""The mesh of each node that has one, and where it stands, `(4, 4)` float64."""
 
 
 @dataclass
@@ -106,14 +113,17 @@ class Document:
         return rows[number]
 
 
-def read_gltf(file: IO[bytes], folder: Path | None) -> Parsed:
-    """Read a .gltf file, its buffers in data URIs or in files of `folder` or below."""
+def read_gltf(file: IO[bytes], folder: Path | None, instances: bool = False) -> Parsed:
+    """Read a .gltf file, its buffers in data URIs or in files of `folder` or below.
+
+    Meshes that several nodes have are kept as geometries where `instances` are asked for.
+    """
     file_size(file)
-    return _flatten_scene(Document(_parse_json(file.read()), None, folder))
+    return _read_scene(Document(_parse_json(file.read()), None, folder), instances)
 
 
-def read_glb(file: IO[bytes], folder: Path | None) -> Parsed:
-    """Read a .glb file; buffers may also lie in files of `folder` or below."""
+def read_glb(file: IO[bytes], folder: Path | None, instances: bool = False) -> Parsed:
+    """Read a .glb file as `read_gltf` does; buffers may also lie in files of `folder` or below."""
     size = file_size(file)
     data = memoryview(file.read())
     if size < 20 or data[:4] != b"glTF":
@@ -129,7 +139,7 @@ def read_glb(file: IO[bytes], folder: Path | None) -> Parsed:
     if not chunks or chunks[0][0] != b"JSON":
         raise UnreadableMeshError("the GLB file does not begin with a JSON chunk", remedy=EXPORT_AGAIN)
     blob = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
-    return _flatten_scene(Document(_parse_json(bytes(chunks[0][1])), blob, folder))
+    return _read_scene(Document(_parse_json(bytes(chunks[0][1])), blob, folder), instances)
 
 
 def integer(value: object, name: str, least: int, most: int = 2**53) -> int:
@@ -178,7 +188,7 @@ def _parse_json(data: bytes) -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------------- arrays
 
 
-def _load_primitives(document: Document) -> dict[int, list[Parsed]]:
+def _load_primitives(document: Document) -> Meshes:
     """The triangles of each mesh, in the order of its primitives."""
     accessors: list[dict[str, Any]] = []
     wanted: list[tuple[int, dict[str, Any]]] = []
@@ -196,7 +206,7 @@ def _load_primitives(document: Document) -> dict[int, list[Parsed]]:
                 sources.append(primitive)
     if skipped:
         document.notes.append(f"{counted(skipped, 'primitive', 'primitives')} of points or lines left out")
-    parts: dict[int, list[Parsed]] = {}
+    parts: Meshes = {}
     for mesh, source, (positions, faces) in zip(
         [mesh for mesh, _ in wanted], sources, _through_trimesh(document, accessors, wanted), strict=True
     ):
@@ -377,35 +387,89 @@ def _load_uri(document: Document, uri: object, name: str) -> bytes:
 # ---------------------------------------------------------------------------------------------- scene
 
 
-def _flatten_scene(document: Document) -> Parsed:
-    """One mesh of all instances of the default scene, in the order of its nodes."""
+def _read_scene(document: Document, keep: bool) -> Parsed:
+    """The meshes of the default scene in the order of its nodes, as geometries where some are to be kept."""
     meshes = _load_primitives(document)
-    instances = _find_instances(document)
-    total = sum(len(part.faces) for mesh, _ in instances for part in meshes.get(mesh, []))
-    if total > MOST_FACES:
+    nodes = _find_instances(document)
+    placed = [(mesh, matrix) for mesh, matrix in nodes if mesh in meshes]
+    repeated = _repeated(placed) if keep else set()
+    total = sum(len(part.faces) for mesh, _ in placed for part in meshes[mesh])
+    if total > MOST_FACES and not repeated:
         raise LimitError(f"{total} triangles with all instances", remedy=f"at most {MOST_FACES} are handled")
-    parts = [_placed(part, matrix) for mesh, matrix in instances for part in meshes.get(mesh, [])]
-    whole = flatten(parts)
-    placed = {mesh for mesh, _ in instances if mesh in meshes}
-    if len(parts) > 1:
-        document.notes.insert(
-            0,
-            f"{counted(len(placed), 'mesh', 'meshes')} in {counted(len(instances), 'instance', 'instances')}"
-            " flattened into one, transforms applied",
-        )
-    elif any(not np.array_equal(matrix, IDENTITY) for _, matrix in instances):
+    whole = _kept_apart(meshes, placed, repeated) if repeated else _flattened(meshes, placed)
+    _note_instances(document, nodes, meshes, repeated)
+    document.notes += [*whole.notes, *notes_on_the_rest(document.left, document.tree)]
+    return with_materials(replace(whole, notes=tuple(document.notes)), document.tree)
+
+
+def _flattened(meshes: Meshes, nodes: Nodes) -> Parsed:
+    """One mesh of the meshes of all nodes."""
+    return flatten([_placed(part, matrix) for mesh, matrix in nodes for part in meshes[mesh]])
+
+
+def _repeated(nodes: Nodes) -> set[int]:
+    """The meshes that stand in several places by matrices that can be kept.
+
+    A matrix that flattens its mesh cannot, for what is flat may still be seen: its mesh is moved once.
+    """
+    times = Counter(mesh for mesh, matrix in nodes if _is_regular(matrix))
+    return {mesh for mesh, count in times.items() if count > 1}
+
+
+def _kept_apart(meshes: Meshes, nodes: Nodes, repeated: set[int]) -> Parsed:
+    """Geometries and instances: repeated meshes as they are, and what stands between them moved at once."""
+    order: list[tuple[int, list[Parsed], np.ndarray]] = []
+    for mesh, matrix in nodes:
+        if mesh in repeated and _is_regular(matrix):
+            order.append((mesh, meshes[mesh], matrix))
+            continue
+        if not order or order[-1][0] in repeated:
+            order.append((-1 - len(order), [], IDENTITY))
+        order[-1][1].extend(_placed(part, matrix) for part in meshes[mesh])
+    geometries = {key: parts for key, parts, _ in order}
+    number = {key: k for k, key in enumerate(geometries)}
+    starts = [
+        np.cumsum([0, *(sum(len(rows(part)) for part in parts) for parts in geometries.values())])
+        for rows in (lambda part: part.faces, lambda part: part.positions)
+    ]
+    whole = flatten([part for parts in geometries.values() for part in parts])
+    return replace(
+        whole,
+        geometries=Geometries(*(one.astype(np.int32) for one in starts)),
+        instances=Instances(
+            np.array([number[key] for key, _, _ in order], np.int32),
+            np.array([matrix[:3] for _, _, matrix in order]),
+        ),
+    )
+
+
+def _note_instances(document: Document, nodes: Nodes, meshes: Meshes, repeated: set[int]) -> None:
+    """Say what became of meshes, instances and mirrors."""
+    placed = [mesh for mesh, _ in nodes if mesh in meshes]
+    what = f"{counted(len(set(placed)), 'mesh', 'meshes')} in {counted(len(nodes), 'instance', 'instances')}"
+    if repeated:
+        kept = counted(len(repeated), "repeated mesh", "repeated meshes")
+        document.notes.insert(0, f"{what}, {kept} stored once, other transforms applied")
+    elif sum(len(meshes[mesh]) for mesh in placed) > 1:
+        document.notes.insert(0, f"{what} flattened into one, transforms applied")
+    elif any(not is_identity(matrix) for _, matrix in nodes):
         document.notes.append("the transform of the one instance applied")
-    unplaced = len(set(meshes) - placed)
+    unplaced = len(meshes) - len(set(placed))
     if unplaced:
         document.notes.append(f"{counted(unplaced, 'mesh', 'meshes')} outside the scene left out")
-    mirrored = sum(bool(np.linalg.det(matrix[:3, :3]) < 0) for _, matrix in instances)
+    mirrored = sum(_mirrors(matrix) for mesh, matrix in nodes if mesh not in repeated)
     if mirrored:
         document.notes.append(
             f"winding turned in {counted(mirrored, 'mirrored instance', 'mirrored instances')}"
         )
-    document.notes += [*whole.notes, *notes_on_the_rest(document.left, document.tree)]
-    whole = Parsed(whole.positions, whole.faces, tuple(document.notes), whole.attributes)
-    return with_materials(whole, document.tree)
+
+
+def _is_regular(matrix: np.ndarray) -> bool:
+    return bool(np.isfinite(matrix).all()) and determinant_signs(matrix[None])[0] != 0
+
+
+def _mirrors(matrix: np.ndarray) -> bool:
+    return bool(np.isfinite(matrix).all()) and determinant_signs(matrix[None])[0] < 0
 
 
 def _placed(part: Parsed, matrix: np.ndarray) -> Parsed:
@@ -413,16 +477,13 @@ def _placed(part: Parsed, matrix: np.ndarray) -> Parsed:
 
     A mirror turns the winding (glTF 2.0, section 3.7.4): the second and third corner change places.
     """
-    if np.array_equal(matrix, IDENTITY):
+    if is_identity(matrix):
         return part
-    with np.errstate(invalid="ignore", over="ignore"):
-        positions = part.positions.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        mirrored = np.linalg.det(matrix[:3, :3]) < 0
-    faces = part.faces[:, [0, 2, 1]] if mirrored else part.faces
-    return Parsed(positions, faces, attributes=turned(part.attributes, matrix))
+    faces = part.faces[:, [0, 2, 1]] if _mirrors(matrix) else part.faces
+    return Parsed(place(part.positions, matrix), faces, attributes=turned(part.attributes, matrix))
 
 
-def _find_instances(document: Document) -> list[tuple[int, np.ndarray]]:
+def _find_instances(document: Document) -> Nodes:
     """Mesh and matrix of each node of the scene that has a mesh, parents first, children in order."""
     nodes, meshes = document.table("nodes"), document.table("meshes")
     roots = _find_roots(document, nodes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def with_materials(parsed: Parsed, tree: dict[str, Any]) -> Parsed:
         groups, materials = number_materials(known, numbers.reshape(-1))
         kept = tuple(one for one in attributes if one.name != "group")
         attributes = (*kept, Attribute("group", "face", groups))
-    return Parsed(parsed.positions, parsed.faces, parsed.notes, attributes, materials, "m")
+    return replace(parsed, attributes=attributes, materials=materials, unit="m")
 
 
 def notes_on_the_rest(left: Counter[str], tree: dict[str, Any]) -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from striptools.errors import LimitError, UnreadableMeshError
 from striptools.mesh.attributes import Attribute, Material, join_attributes, tidy_name
+from striptools.mesh.instances import Geometries, Instances
 from striptools.mesh.mesh import MOST_FACES
 
 EXPORT_AGAIN = "export the model again"
@@ -29,6 +30,8 @@ class Parsed:
         attributes: What else it found, of right shape and type.
         materials: What the groups stand for.
         unit: The length that 1 stands for, where the format or file says so.
+        geometries: Which faces and vertices are one geometry, where they are kept apart.
+        instances: Where geometries stand, there where `geometries` are.
     """
 
     positions: np.ndarray
@@ -37,6 +40,8 @@ class Parsed:
     attributes: tuple[Attribute, ...] = ()
     materials: tuple[Material, ...] = ()
     unit: str | None = None
+    geometries: Geometries | None = None
+    instances: Instances | None = None
 
 
 @dataclass(frozen=True, eq=False)

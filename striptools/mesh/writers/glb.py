@@ -1,4 +1,4 @@
-"""GLB with normals, texture coordinates, colours and materials: one mesh, a primitive a group.
+"""GLB with normals, texture coordinates, colours, materials and instances: a primitive a group.
 
 What holds of the file (Khronos glTF 2.0 specification): chunks and accessors begin at multiples of four, rows
 of vertex attributes are multiples of four long (3.6.2.4), POSITION has its exact float32 bounds (3.7.2.1).
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from striptools.mesh.attributes import Attribute, Material
+from striptools.mesh.instances import is_identity
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.writers.split import split_vertices
 
@@ -55,26 +56,20 @@ class _Buffer:
 
 
 def encode_glb(mesh: Mesh) -> bytes:
-    """The mesh as a GLB file; its faces are put in the order of their groups, stable within one."""
-    mesh = split_vertices(mesh, ("normal", "texcoord", "color"))
+    """The mesh as a GLB file; its faces are put in the order of their groups, stable within one.
+
+    Geometries become meshes, and instances nodes with matrices.
+    """
     buffer = _Buffer()
-    with np.errstate(all="ignore"):
-        positions = mesh.positions.astype(np.float32)
-    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    accessors = {"POSITION": buffer.add(positions, FLOAT, ARRAY_BUFFER, **bounds)}
-    for one in mesh.attributes:
-        if one.name in SEMANTICS:
-            accessors[SEMANTICS[one.name]] = _add_attribute(buffer, one)
-    primitives = [
-        {"attributes": accessors, "indices": indices, **({} if group is None else {"material": group})}
-        for group, indices in _groups(mesh, buffer)
-    ]
+    nodes: list[dict[str, Any]] = [{"mesh": 0}]
+    if mesh.instances is not None:
+        nodes = [_node(geometry, matrix) for geometry, matrix in mesh.instances]
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "striptools"},
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": primitives}],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": [{"primitives": _primitives(part, buffer)} for part in mesh.parts()],
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
@@ -82,6 +77,29 @@ def encode_glb(mesh: Mesh) -> bytes:
     if mesh.attribute("group") is not None:
         tree["materials"] = [_material(one) for one in mesh.materials]
     return _chunks(json.dumps(tree, separators=(",", ":")).encode(), bytes(buffer.data))
+
+
+def _node(geometry: int, matrix: np.ndarray) -> dict[str, Any]:
+    """A node of a mesh where a `(3, 4)` matrix puts it; matrices go by columns."""
+    if is_identity(matrix):
+        return {"mesh": geometry}
+    return {"mesh": geometry, "matrix": np.vstack([matrix, [0, 0, 0, 1]]).T.reshape(-1).tolist()}
+
+
+def _primitives(mesh: Mesh, buffer: _Buffer) -> list[dict[str, Any]]:
+    """The primitives of a plain mesh, a group each."""
+    mesh = split_vertices(mesh, ("normal", "texcoord", "color"))
+    with np.errstate(all="ignore"):
+        positions = mesh.positions.astype(np.float32)
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    accessors = {"POSITION": buffer.add(positions, FLOAT, ARRAY_BUFFER, **bounds)}
+    for one in mesh.attributes:
+        if one.name in SEMANTICS:
+            accessors[SEMANTICS[one.name]] = _add_attribute(buffer, one)
+    return [
+        {"attributes": accessors, "indices": indices, **({} if group is None else {"material": group})}
+        for group, indices in _groups(mesh, buffer)
+    ]
 
 
 def _add_attribute(buffer: _Buffer, one: Attribute) -> int:
