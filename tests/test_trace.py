@@ -17,6 +17,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 from striptools.trace.launch import _collect, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
+from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
 
 LOWEST = np.finfo(np.float32).min
@@ -296,7 +297,7 @@ def test_walking_all_rays_at_once_gives_the_same(ball):
         lay_out(ball).arrays, origins, directions, reach, options=options
     )
     np.testing.assert_array_equal(traced.t, expected.t)
-    np.testing.assert_array_equal(traced.face, expected.face)
+    np.testing.assert_array_equal(traced.name, expected.face)
     assert np.asarray(traced.steps).min() >= 1
 
 
@@ -333,9 +334,11 @@ def test_there_is_no_third_hierarchy(ball):
 
 
 @pytest.mark.parametrize("unit", [2.0**-100, 1e-3, 1.0, 2.0**100])
-def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit):
+@pytest.mark.parametrize("lay", [lay_out, lay_out_packed])
+def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
     scene = with_positions(ball, (ball.positions * np.float32(unit)).astype(np.float32))
-    arrays = lay_out(scene).arrays
+    layout = lay(scene)
+    arrays = layout.arrays
     origins, directions = aimed_rays(scene.positions, scene.faces(), 2000, 12)
     random = np.random.default_rng(13)
     odd = np.array([0, -0.0, 1e-45, -1e-39, 1e-20, -1e-25, 1, -3, 1e30, 3e38, np.inf, -np.inf, np.nan], "f4")
@@ -345,7 +348,7 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit):
     device = np.asarray(jax.jit(prepared_rays)(arrays, origins, directions, reach))
     rows, at = aligned_full((2000, ROW), 0.0), np.zeros(2000, np.int32)
     dropped = np.zeros(2000, np.uint8)
-    root = (arrays.scale, arrays.reach, arrays.nodes[0], arrays.nodes[0, 6].view(np.int32))
+    root = (tuple(arrays.frame), *layout.root)
     count, end = ready_rays(
         origins, directions, reach, 0, *root, False, rows, rows.view(np.int32), at, dropped
     )
