@@ -1,11 +1,9 @@
 """Kernels of the tracer of packed blocks: what it keeps of the nodes, and where on its face a hit lies."""
 
-from math import ldexp
-
 import numpy as np
 from numba import njit
 
-from striptools.kernels.blocks import axis_of, block_counts, take
+from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_corners
 
@@ -45,6 +43,84 @@ def depth_of(words, records, top_count):
 
 
 @njit(cache=True, nogil=True)
+def least_exponent(headers, words):
+    """The exponent of the least power of two that is in a coordinate of mode 2; 0 where all are larger."""
+    least = np.int64(0)
+    for block in range(len(headers)):
+        connectivity, size = block_bits(headers, block)
+        _, vertices, _, _, _ = block_counts(headers, block)
+        stride = size // vertices
+        bit = (np.int64(headers[block, 1]) << 5) + connectivity
+        for axis in range(3):
+            mode, width, anchor, _ = axis_of(headers, block, axis)
+            if mode == 2:
+                for k in range(vertices):
+                    whole = take(words, bit + k * stride, width) + anchor
+                    bits = whole if whole >= 0 else -1 - whole
+                    if bits > 0:
+                        least = min(least, (bits >> 23) - 127 if bits >= 0x800000 else np.int64(-149))
+            bit += width
+    return least
+
+
+@njit(cache=True, nogil=True)
+def describe_runs(headers, words, first_run, runs, begin, end, described):
+    """Say of each run of the blocks `begin:end` all that its triangles' places are found by.
+
+    In the order of a strip's vertices, newest behind, triangle j of a run whose first vertex is number p has
+    vertex p + j + 2 for its newest corner and p + j + 1 for its near one; by its turn the near one is a or b.
+    The far one is p + u + 1, u the last triangle of the run up to j of another turn, or what it was for the
+    run's first triangle where there is none. A strip's first triangle is like one of turn 1.
+
+    Args:
+        headers: (b, 8) uint32.
+        words: (w,) uint32.
+        first_run: (b+1,) int64.
+        runs: (r,) uint16.
+        begin: The first block.
+        end: Where they end.
+        described: (r,) uint32, written. Bits 0 to 7: the first triangle; 8 to 10: triangles, less one; 11 to
+            18: the strip, counted in the block; 19 to 26: turns; 27 to 31: p + 1 - k is the far corner's place
+            for the first triangle, this is k.
+    """
+    strip_of = np.empty(256, np.int64)
+    start_of = np.empty(256, np.int64)
+    turn_of = np.empty(256, np.int64)
+    last_of = np.empty(256, np.int64)
+    for block in range(begin, end):
+        # Follow the strips: of each triangle its strip, its turn, and the last other turn.
+        count = block_counts(headers, block)[0]
+        bit = np.int64(headers[block, 1]) << 5
+        strip = np.int64(-1)
+        start = np.int64(0)
+        for t in range(count):
+            turn = take(words, bit + count + t, 1)
+            if take(words, bit + t, 1):
+                strip += 1
+                start = t
+                turn = np.int64(1)
+                last_of[t] = -1
+            elif turn != turn_of[t - 1]:
+                last_of[t] = t - 1
+            else:
+                last_of[t] = last_of[t - 1]
+            strip_of[t] = strip
+            start_of[t] = start
+            turn_of[t] = turn
+
+        # Write the runs.
+        for run in range(first_run[block], first_run[block + 1]):
+            first = np.int64(runs[run]) & 255
+            length = np.int64(runs[run]) >> 8 & 7
+            turns = np.int64(0)
+            for j in range(length + 1):
+                turns |= turn_of[first + j] << j
+            last = last_of[first]
+            back = first - last if last >= 0 else first - start_of[first] + turn_of[first]
+            described[run] = first | length << 8 | strip_of[first] << 11 | turns << 19 | back << 27
+
+
+@njit(cache=True, nogil=True)
 def block_of(headers, triangle):
     """The block that a triangle in file order is in."""
     low = np.int64(0)
@@ -58,6 +134,15 @@ def block_of(headers, triangle):
     return low
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def bits_set(number):
+    """How many bits of a number below 2**32 are set."""
+    number -= number >> 1 & 0x55555555
+    number = (number & 0x33333333) + (number >> 2 & 0x33333333)
+    number = (number + (number >> 4)) & 0x0F0F0F0F
+    return number * 0x01010101 >> 24 & 0xFF
+
+
 @njit(cache=True, nogil=True)
 def corner_indices(headers, words, block, t):
     """The indices of triangle t of a block: SPEC 4.3, alone."""
@@ -66,11 +151,11 @@ def corner_indices(headers, words, block, t):
 
     # Find the strip.
     strip = np.int64(-1)
-    first = np.int64(0)
-    for k in range(t + 1):
-        if take(words, bit + k, 1):
-            strip += 1
-            first = k
+    for k in range(0, t + 1, 32):
+        strip += bits_set(take(words, bit + k, min(t + 1 - k, 32)))
+    first = t
+    while take(words, bit + first, 1) == 0:
+        first -= 1
 
     # Find the last other turn.
     turn = take(words, bit + count + t, 1)
@@ -91,32 +176,40 @@ def corner_indices(headers, words, block, t):
     return a, b, c
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def power_of_two(exponent):
+    """2**exponent as float64, exponent from -1022 to 1023."""
+    return np.int64((exponent + 1023) << 52).view(np.float64)
+
+
 @njit(cache=True, nogil=True)
-def scaled_vertex(headers, words, block, vertex, scale_exponent, corner):
-    """Fill corner (3,) float32 with a block's vertex times 2**scale_exponent; zero for denormals."""
+def scaled_corners(headers, words, block, indices, scale_exponent, corners):
+    """Fill corners (3, 3) float32, a row each, with three of a block's vertices times 2**scale_exponent.
+
+    What is not a normal number then is zero, as the walks have it.
+    """
     count, _, strips, has_flips, index_width = block_counts(headers, block)
-    bit = (np.int64(headers[block, 1]) << 5) + (2 + has_flips) * count + (count + 2 * strips) * index_width
-    stride = np.int64(0)
-    for axis in range(3):
-        stride += axis_of(headers, block, axis)[1]
-    bit += vertex * stride
+    begin = (np.int64(headers[block, 1]) << 5) + (2 + has_flips) * count + (count + 2 * strips) * index_width
+    stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
     for axis in range(3):
         mode, width, anchor, exponent = axis_of(headers, block, axis)
-        number = take(words, bit, width)
-        bit += width
-        whole = number + anchor
-        size = abs(whole)
-        if mode == 2:
-            # Take the bits of the float apart.
-            bits = whole if whole >= 0 else -1 - whole
-            field = bits >> 23
-            size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
-            exponent = max(field, 1) - 150
-        elif mode == 1 and number == (1 << width) - 1:
-            size = np.int64(0)
-        exact = np.float64(size) * ldexp(1.0, exponent + scale_exponent)
-        value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
-        corner[axis] = -value if whole < 0 else value
+        unit = power_of_two(exponent + scale_exponent)
+        for j in range(3):
+            number = take(words, begin + indices[j] * stride, width)
+            whole = number + anchor
+            size = abs(whole)
+            if mode == 2:
+                # Take the bits of the float apart.
+                bits = whole if whole >= 0 else -1 - whole
+                field = bits >> 23
+                size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
+                unit = power_of_two(max(field, 1) - 150 + scale_exponent)
+            elif mode == 1 and number == (1 << width) - 1:
+                size = np.int64(0)
+            exact = np.float64(size) * unit
+            value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
+            corners[j, axis] = -value if whole < 0 else value
+        begin += width
 
 
 @njit(cache=True, nogil=True)
@@ -125,10 +218,10 @@ def weigh_packed_hits(
     directions,
     at,
     found_t,
-    found_face,
-    found_triangle,
+    found,
     headers,
     words,
+    faces,
     rotations,
     scale,
     scale_exponent,
@@ -145,10 +238,10 @@ def weigh_packed_hits(
         directions: (r, 3) float32, not zero where there is a hit.
         at: (k,) int32, the rays that results are for; others are left alone.
         found_t: (k,) float32, t of each.
-        found_face: (k,) int32, the reported face; negative on a miss.
-        found_triangle: (k,) int32, the triangle in file order.
+        found: (k,) int32, the triangle in file order; negative on a miss.
         headers: (b, 8) uint32.
         words: (w,) uint32.
+        faces: (>= n,) int32, the reported face of each triangle; (0,) where triangles are faces.
         rotations: (n,) uint8, places that the reported face's corners were turned to the left; or (0,).
         scale: float32, what positions are multiplied by.
         scale_exponent: Its exponent.
@@ -164,19 +257,20 @@ def weigh_packed_hits(
     for k in range(len(at)):
         r = at[k]
         t[r] = found_t[k]
-        face[r] = found_face[k]
-        if face[r] < 0:
+        face[r] = found[k]
+        triangle[r] = found[k]
+        if found[k] < 0:
             u[r] = 0.0
             v[r] = 0.0
             triangle[r] = -1
             continue
+        if len(faces) > 0:
+            face[r] = faces[found[k]]
 
         # Decode the triangle, and turn it as the tests do.
-        triangle[r] = found_triangle[k]
         block = block_of(headers, triangle[r])
         indices = corner_indices(headers, words, block, np.int64(triangle[r]) - np.int64(headers[block, 0]))
-        for j in range(3):
-            scaled_vertex(headers, words, block, indices[j], scale_exponent, decoded[j])
+        scaled_corners(headers, words, block, indices, scale_exponent, decoded)
         turn = first_corner(decoded)
         for j in range(3):
             for axis in range(3):

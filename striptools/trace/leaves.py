@@ -14,7 +14,7 @@ from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
 from striptools.partition.object_split import split_objects
 from striptools.trace.box import MARGIN
-from striptools.trace.walk import DONE, NO_FACE, Frame
+from striptools.trace.walk import DONE, NO_NAME, Frame
 from striptools.trace.walk_wide import WideScene
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def lay_out_wide(scene: "Scene", wide: WideTree, order: Int32[np.ndarray, " n"] 
     scale = scale_of(scene)
     leaves = len(wide.leaf_first)
     blocks = aligned_full((size_class(leaves), 10, WIDTH), np.nan)
-    blocks[:, 9] = NO_FACE.view(np.float32)
+    blocks[:, 9] = NO_NAME.view(np.float32)
     face_count = int(ids.max()) + 1
     place = np.zeros(face_count, np.int32)
     fill_leaf_blocks(

@@ -7,12 +7,17 @@ import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid, PackedNodes
 from striptools.kernels import packed_hits as kernels
+from striptools.threads import in_chunks
 from striptools.trace.leaves import Found, Rays, aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
-from striptools.trace.walk_packed import LANES, MARGIN, SLACK_WORDS, PackedScene
+from striptools.trace.walk_packed import MARGIN, SLACK_WORDS, PackedScene
 
 if TYPE_CHECKING:
+    from striptools.reducem.blocks import Blocks
     from striptools.reducem.scene import Scene
+
+SMALLEST = 64
+"""Blocks below which another thread is not worth its start."""
 
 STEPS = 16
 """Size classes to each doubling: 4 % of memory at most for programs that scenes share."""
@@ -64,10 +69,9 @@ class PackedLayout:
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
-        triangle = traced[2] if len(traced[2]) else traced[1]
         headers = arrays.headers[: self.blocks]
-        kept = (headers, arrays.words, self.rotations, arrays.frame.scale, int(arrays.scale_exponent))
-        kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], triangle, *kept, *found)
+        kept = (headers, arrays.words, arrays.faces, self.rotations, arrays.frame.scale, int(arrays.scale_exponent))
+        kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], *kept, *found)
 
 
 def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
@@ -78,6 +82,7 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     nodes = _padded(packed.nodes, len(packed.nodes) + 1)
     planes = nodes.view(np.uint8)
     kernels.mark_leaves(nodes, planes, packed.top_count)
+    described = _described(packed, blocks, threads)
     scale = scale_of(scene)
     exponent = int(np.frexp(scale)[1]) - 1
     faces, rotations = _names(scene)
@@ -87,7 +92,7 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
         _padded(blocks.headers, blocks.count),
         _padded(blocks.words, len(blocks.words) + SLACK_WORDS),
         _padded(packed.first_run, blocks.count),
-        _padded(packed.runs, len(packed.runs)),
+        _padded(described, len(described)),
         faces,
         np.uint32(packed.top_count),
         np.int32(exponent),
@@ -95,27 +100,38 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     )
     count = len(packed.nodes)
     depth = int(kernels.depth_of(nodes[:count], planes[:count], packed.top_count))
-    return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks.headers, exponent), depth)
+    return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks, exponent), depth)
 
 
-def decode_of(headers: np.ndarray, scale_exponent: int) -> Decode:
+def _described(packed: PackedNodes, blocks: "Blocks", threads: int) -> np.ndarray:
+    """(r,) uint32: what the walk is told of each run."""
+    assert packed.first_run is not None
+    assert packed.runs is not None
+    described = np.zeros(len(packed.runs), np.uint32)
+    starts = np.append(packed.first_run, len(packed.runs)).astype(np.int64)
+    given = (blocks.headers, blocks.words, starts, packed.runs)
+    in_chunks(lambda part: kernels.describe_runs(*given, *part, described), blocks.count, threads, SMALLEST)
+    return described
+
+
+def decode_of(blocks: "Blocks", scale_exponent: int) -> Decode:
     """What a walk has to compile in for these blocks.
 
     Args:
-        headers: (b, 8) uint32.
+        blocks: Whose rules are kept.
         scale_exponent: That of the power of two that coordinates are multiplied by.
     """
-    axes = np.stack([headers[:, 6] >> np.uint32(8 * axis) & 0xFF for axis in range(3)], axis=1)
+    headers = blocks.headers
+    mode, width = blocks.axes()
     exponents = np.stack([headers[:, 6] >> 24, headers[:, 7] & 0xFF, headers[:, 7] >> 8 & 0xFF], axis=1)
-    width, mode = axes & 63, axes >> 6
-    stride = int(width.sum(axis=1).max())
-    lowest = np.where(mode == 2, 0, exponents).astype(np.int64) - 149 + scale_exponent
+    least = int(np.where(mode == 2, 0, exponents.astype(np.int64) - 149).min())
+    least = min(least, int(kernels.least_exponent(headers, blocks.words)))
     return Decode(
-        max(1, (stride + 31 + 31) // 32),
-        bool((mode == 1).any()),
-        bool((mode == 2).any()),
-        bool((headers[:, 2] >> 24 & 1).any()),
-        bool((lowest < -126).any()),
+        words=max(1, (int(width.sum(axis=1).max()) + 31 + 31) // 32),
+        minus_zero=bool((mode == 1).any()),
+        as_bits=bool((mode == 2).any()),
+        flips=bool((headers[:, 2] >> 24 & 1).any()),
+        tiny=min(least, least + scale_exponent) < -126,
     )
 
 
@@ -132,7 +148,7 @@ def _names(scene: "Scene") -> tuple[np.ndarray, np.ndarray]:
     """The face that a hit on each triangle is reported as, and how its corners are turned; or nothing."""
     if scene.remap is None:
         return np.zeros(0, np.int32), np.zeros(0, np.uint8)
-    return _padded(scene.remap.face, len(scene.remap.face) + LANES), scene.remap.rotation
+    return _padded(scene.remap.face, len(scene.remap.face)), scene.remap.rotation
 
 
 def _padded(values: np.ndarray, count: int) -> np.ndarray:

@@ -135,7 +135,7 @@ class Tracer:
         found = (t, face, u, v, triangle)
         for at, traced in self._stream(rays, dropped, any_hit=False, steps=steps):
             if steps:
-                counted[at] = traced[3]
+                counted[at] = traced[2]
             _check_ended(traced[1])
             # On this side, while the devices are at the next rays.
             self._layout.weigh(rays, at, traced, found)

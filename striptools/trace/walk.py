@@ -44,9 +44,9 @@ DONE = np.int32(-(2**31))
 
 MISS = np.int32(-1)
 STUCK = np.int32(-2)
-"""The face of a ray whose walk did not end within the bound."""
+"""The name of a ray whose walk did not end within the bound."""
 
-NO_FACE = np.int32(2**31 - 1)
+NO_NAME = np.int32(2**31 - 1)
 SLACK = np.float32(1 + 2**-20)
 
 
@@ -69,15 +69,11 @@ class Frame(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The closest hit of all, or t_max, and the closest in each lane: (8,).
-
-    `triangle` has no entries where faces are triangles in file order.
-    """
+    """The closest hit of all, or t_max, and the closest in each lane: (8,), `name` what the scene calls it."""
 
     nearest: Array
     t: Array
-    face: Array
-    triangle: Array
+    name: Array
 
 
 class WalkScene(Protocol):
@@ -95,7 +91,11 @@ class WalkScene(Protocol):
 
     @property
     def has_faces(self) -> bool:
-        """Whether faces are reported that are not the triangles in file order."""
+        """Whether names are triangles in file order, and faces something else."""
+        ...
+
+    def faces_of(self, names: Array) -> Array:
+        """(8,) int32: the faces of hits, negative where there is none."""
         ...
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
@@ -150,11 +150,10 @@ class Decode(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """One entry a ray; what was not asked for, or is `face` again, has no entries."""
+    """One entry a ray; what was not asked for has no entries. `name` is what the scene calls the triangle hit."""
 
     t: Array
-    face: Array
-    triangle: Array
+    name: Array
     steps: Array
 
 
@@ -259,10 +258,10 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     else:
         # One group's stacks serve the next: only their bottom is read before it is written.
         walked = lax.scan(walk, stacks, rows)[1]
-    t, face, triangle, steps = (a.reshape(-1) for a in walked)
+    t, name, steps = (a.reshape(-1) for a in walked)
     if options.any_hit:
         t = jnp.zeros(0)
-    return Traced(t, face, triangle, steps)
+    return Traced(t, name, steps)
 
 
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
@@ -318,33 +317,33 @@ def _visit_node(
     return _Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
-def closer_of(best: Best, t: Array, face: Array, triangle: Array) -> Best:
-    """The closer of what each lane has and a new crossing of its own, where `t` is positive."""
-    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.face)))
+def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
+    """The closest hits where `closer` says in which lanes new ones take their place."""
     t = jnp.where(closer, t, best.t)
-    if len(best.triangle):
-        triangle = jnp.where(closer, triangle, best.triangle)
-    return Best(folded(t, smaller), t, jnp.where(closer, face, best.face), triangle[: len(best.triangle)])
+    return Best(folded(t, smaller), t, jnp.where(closer, name, best.name))
 
 
-def _closest_face(best: Best) -> tuple[Array, Array]:
-    """The least face of the lanes that hold the closest hit, `MISS` where none does, and its triangle."""
-    face = jnp.where((best.t == best.nearest) & (best.face >= 0), best.face, NO_FACE)
-    least = folded(face, smaller)
-    triangle = best.triangle
-    if len(triangle):
-        # A face is in one triangle alone.
-        found = jnp.where(face == least, triangle, NO_FACE)
-        triangle = jnp.where(least == NO_FACE, MISS, folded(found, smaller))[None]
-    return jnp.where(least == NO_FACE, MISS, least), triangle
+def _closest_name(scene: WalkScene, best: Best, any_hit: bool) -> Array:
+    """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none."""
+    held = (best.t == best.nearest) & (best.name >= 0)
+    names = jnp.where(held, best.name, NO_NAME)
+    least = folded(names, smaller)
+    if scene.has_faces and not any_hit:
+        several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
+        least = lax.cond(several, lambda: _name_of_least(scene, names), lambda: least)
+    return jnp.where(least == NO_NAME, MISS, least)
+
+
+def _name_of_least(scene: WalkScene, names: Array) -> Array:
+    faces = jnp.where(names == NO_NAME, NO_NAME, scene.faces_of(names))
+    return folded(jnp.where(faces == folded(faces, smaller), names, NO_NAME), smaller)
 
 
 class _Walked(NamedTuple):
     """One entry for each ray of a group, as in `Traced`."""
 
     t: Array
-    face: Array
-    triangle: Array
+    name: Array
     steps: Array
 
 
@@ -429,10 +428,8 @@ def _walk_group(
     walk = _Walk(scene, rays, options)
     zero = jnp.int32(0)
     places = tuple(ray.start for ray in rays)
-    none = jnp.full(WIDTH, MISS, jnp.int32)
-    named = scene.has_faces and not options.any_hit
     bests = tuple(
-        Best(ray.t_max, jnp.full(WIDTH, ray.t_max), none, none if named else none[:0]) for ray in rays
+        Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
     )
     steps = tuple(ray.visited for ray in rays) if options.count_steps else ()
 
@@ -450,14 +447,16 @@ def _walk_group(
         nodes_then_leaves,
         (_State(places, stacks, zero, steps), bests),
     )
-    results = [_result(*each) for each in zip(rays, state.places, bests, strict=True)]
-    t, face, triangle = (jnp.stack([r[k] for r in results]) for k in range(3))
+    results = [
+        _result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)
+    ]
+    t, name = (jnp.stack([r[k] for r in results]) for k in range(2))
     counted = jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0))
-    return state.stacks, _Walked(t, face, triangle, counted)
+    return state.stacks, _Walked(t, name, counted)
 
 
-def _result(ray: _Ray, place: _Place, best: Best) -> tuple[Array, Array, Array]:
-    """What is reported of a ray: t in the caller's units, the face, and the triangle."""
-    face, triangle = _closest_face(best)
-    t = jnp.where(face < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
-    return t, jnp.where(place.child != DONE, STUCK, face), triangle
+def _result(scene: WalkScene, ray: _Ray, place: _Place, best: Best, any_hit: bool) -> tuple[Array, Array]:
+    """What is reported of a ray: t in the caller's units, and the name of the triangle."""
+    name = _closest_name(scene, best, any_hit)
+    t = jnp.where(name < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
+    return t, jnp.where(place.child != DONE, STUCK, name)

@@ -24,6 +24,7 @@ needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell
 move by less than 2^-100.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -33,13 +34,14 @@ from jax import Array, lax
 from striptools.trace.box import Slab, passes
 from striptools.trace.numerics import folded, index, larger
 from striptools.trace.triangle import Shear, crossing_of, edges_of, pick
-from striptools.trace.walk import DONE, WIDTH, Best, Decode, Frame, WalkOptions, closer_of
+from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
 
 LANES = 8
 BLOCK_BITS = 0xFFFFFF
+ALL = np.uint32(0xFFFFFFFF)
 SLACK_WORDS = 16
 """Words behind the stream that a load may touch."""
 
@@ -54,8 +56,8 @@ class PackedScene(NamedTuple):
         headers: (b, 8) uint32, SPEC 4.2.
         words: (w,) uint32, the streams, `SLACK_WORDS` and more behind them.
         first_run: (b,) uint32.
-        runs: (r,) uint16.
-        faces: (n + 8,) int32, the reported face of each triangle in file order; (0,) where they are their own.
+        runs: (r,) uint32, as `kernels.packed_hits.describe_runs` has them.
+        faces: (n,) int32, the reported face of each triangle in file order; (0,) where they are their own.
         top_count: () uint32, nodes over blocks.
         scale_exponent: () int32, of the frame's scale.
         frame: How rays are seen: boxes are counted from the grid's low, in its cells.
@@ -115,80 +117,90 @@ class PackedScene(NamedTuple):
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""
         assert options.decode is not None
-        block, bits = self._run_of(child)
-        header = lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0]
-        first = bits & 0xFF
+        # Behind barriers, or XLA finds the run anew for every use of it.
+        block, run = lax.optimization_barrier(self._run_of(child))
+        header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
+        first = header[0] + (run & 0xFF)
         lane = jnp.arange(LANES, dtype=jnp.uint32)
-        corners = self._corners(header, first, first + lane, options.decode.flips)
+        corners = self._corners(header, run, options.decode.flips)
         x, y, z = self._positions(header, corners, options.decode)
         turn = _first_corner(x, y, z)
         along = [tuple(pick(triple, axis) for triple in zip(x, y, z, strict=True)) for axis in shear.axes]
         t = crossing_of(edges_of(*along, shear), turn)
-        t = jnp.where(lane <= bits >> 8, t, jnp.float32(0))
-        triangle = (header[0] + first + lane).astype(jnp.int32)
-        face = triangle
-        if self.has_faces:
-            face = lax.dynamic_slice(self.faces, (header[0] + first,), (LANES,))
-        return closer_of(best, t, face, triangle)
+        t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
+        triangle = (first + lane).astype(jnp.int32)
+        found = _any((t > 0) & (t <= best.t))
+        return lax.cond(found, lambda: self._merged(best, t, triangle, options.any_hit), lambda: best)
+
+    def _merged(self, best: Best, t: Array, triangle: Array, any_hit: bool) -> Best:
+        """The closest hits with those of a run; faces are only read for hits at the same t."""
+        tied = (t > 0) & (t == best.t)
+        if any_hit:
+            tied = jnp.zeros_like(tied)
+        elif self.has_faces:
+            mine, others = (lambda: self.faces_of(triangle)), (lambda: self.faces_of(best.name))
+            tied = lax.cond(_any(tied), lambda: tied & (mine() < others()), lambda: tied)
+        else:
+            tied = tied & (triangle < best.name)
+        return replaced(best, (t > 0) & (t < best.t) | tied, t, triangle)
+
+    def faces_of(self, names: Array) -> Array:
+        """The faces of triangles; a name that is none keeps its number."""
+        if not self.has_faces:
+            return names
+        return jnp.where(names < 0, names, _at(self.faces, index(names)))
 
     def _run_of(self, child: Array) -> tuple[Array, Array]:
-        """The block of a leaf, and the bits of its run."""
+        """The block of a leaf, and what is said of its run."""
         code = index(~child)
         node, slot = code >> 3, code & 7
-        head = lax.dynamic_slice(self.nodes, (node, jnp.uint32(0)), (1, 4))[0]
-        low = lax.dynamic_slice(self.planes, (node, jnp.uint32(16)), (1, LANES))[0]
-        high = lax.dynamic_slice(self.planes, (node, jnp.uint32(40)), (1, LANES))[0]
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
-        is_leaf = (low <= high) & ((head[3] >> 16 >> lane & 1) == 0) & (lane < slot)
-        rank = folded(jnp.where(is_leaf, jnp.uint32(1), jnp.uint32(0)), jnp.add)
-        block = head[1] & BLOCK_BITS
-        run = _at(self.first_run, block) + (head[1] >> 24) + rank
-        return block, _at(self.runs, run).astype(jnp.uint32)
+        record = lax.dynamic_slice(self.nodes, (node, jnp.uint32(0)), (1, 16))[0]
+        inner, below = record[3] >> 16 & 0xFF, (jnp.uint32(1) << slot) - 1
+        bits = 8 * (slot & 3)
+        under = (jnp.uint32(1) << bits) - 1
+        first = _used_bytes(record[4], record[10]) & jnp.where(slot < 4, under, ALL)
+        second = _used_bytes(record[5], record[11]) & jnp.where(slot < 4, 0, under)
+        rank = lax.population_count(first | second >> 1) - lax.population_count(inner & below)
+        block = record[1] & BLOCK_BITS
+        return block, _at(self.runs, _at(self.first_run, block) + (record[1] >> 24) + rank)
 
-    def _corners(self, header: Array, first: Array, t: Array, flips: bool) -> tuple[Array, Array, Array]:
-        """The indices of corners a, b, c of the triangles t (8,) of a block, all in the strip of `first`."""
+    def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
+        """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
         word, counts = header[1], header[2]
         triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1
-        strip, strip_first = self._strip_of(word, first)
-        before = self._window(word, (triangles + t).astype(jnp.int32) - 31)
+        lane = jnp.arange(LANES, dtype=jnp.uint32)
+        first = run & 0xFF
+        place = first + 2 * (run >> 11 & 0xFF) + 1
 
-        # The far corner is what the last other turn left behind; a strip's first triangle is like a turn of 1.
-        is_first = t == strip_first
-        turned = (before >> 31 != 0) | is_first
-        other = jnp.where(turned, ~before, before)
-        last = t.astype(jnp.int32) - lax.clz(other).astype(jnp.int32)
-        left = strip_first.astype(jnp.int32)
-        start = jnp.where(turned, left, left + 1)
-        far = jnp.where((last > left) & ~is_first, last + 1, start).astype(jnp.uint32) + 2 * strip
+        # The far corner is what the last other turn left behind.
+        turns = run >> 19 & 0xFF
+        turned = (turns >> lane & 1) != 0
+        other = jnp.where(turned, ~turns, turns) & ((jnp.uint32(2) << lane) - 1)
+        last = 31 - lax.clz(other)
 
         width = 32 - lax.clz(counts >> 8 & 0xFF)
         mask = (jnp.uint32(1) << width) - 1
         indices = (2 + has_flips) * triangles
-        near = self._window(word, (indices + (t + 2 * strip + 1) * width).astype(jnp.int32))
-        distant = self._window(word, (indices + far * width).astype(jnp.int32)) & mask
-        swapped = turned
+        near = self._windows(word, indices + place * width, width * lane)
+        far = self._windows(word, indices + place * width, width * jnp.where(other == 0, 0, last))
+        before = self._windows(word, indices + (place - (run >> 27)) * width, jnp.uint32(0), 2)
+        far = jnp.where(other == 0, before, far) & mask
         if flips:
-            flipped = self._window(word, (2 * triangles + t).astype(jnp.int32)) & has_flips
-            swapped = turned ^ (flipped != 0)
+            flipped = self._windows(word, 2 * triangles + first, lane, 2) & has_flips
+            turned = turned ^ (flipped != 0)
         newest, near = near >> width & mask, near & mask
-        return jnp.where(swapped, distant, near), jnp.where(swapped, near, distant), newest
+        return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
 
-    def _strip_of(self, word: Array, triangle: Array) -> tuple[Array, Array]:
-        """Which strip of its block a triangle is in, and the strip's first triangle."""
-        starts = lax.dynamic_slice(self.words, (word,), (LANES,))
-        first = jnp.arange(LANES, dtype=jnp.uint32) * 32
-        kept = triangle + 1 - first
-        mask = jnp.where(kept < 32, (jnp.uint32(1) << (kept & 31)) - 1, jnp.uint32(0xFFFFFFFF))
-        starts = starts & jnp.where(first <= triangle, mask, 0)
-        strip = folded(lax.population_count(starts), jnp.add) - 1
-        last = first + 31 - lax.clz(starts)
-        return strip, folded(jnp.where(starts != 0, last, 0), larger)
-
-    def _window(self, word: Array, bit: Array) -> Array:
-        """(8,) uint32: 32 bits of a stream from each of (8,) int32 bits on."""
-        at = word + (bit >> 5).astype(jnp.uint32)
-        shift = (bit & 31).astype(jnp.uint32)
-        return _at(self.words, at) >> shift | _at(self.words, at + 1) << 1 << (31 - shift)
+    def _windows(self, word: Array, bit: Array, further: Array, count: int = 4) -> Array:
+        """Uint32: 32 bits of a stream from `bit` plus each of `further` on, all of them in `count` words."""
+        at = word + (bit >> 5)
+        loaded = [_at(self.words, at + k) for k in range(count)]
+        bits = (bit & 31) + further
+        place, shift = bits >> 5, bits & 31
+        lower, upper = loaded[0], loaded[1]
+        for k in range(1, count - 1):
+            lower, upper = jnp.where(place == k, loaded[k], lower), jnp.where(place == k, loaded[k + 1], upper)
+        return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
         self, header: Array, corners: tuple[Array, Array, Array], decode: Decode
@@ -203,11 +215,9 @@ class PackedScene(NamedTuple):
         found = []
         for corner in corners:
             bit = vertices + corner * stride
-            at, shift = header[1] + (bit >> 5), bit & 31
-            loaded = [_at(self.words, at + k) for k in range(decode.words)] + [jnp.zeros_like(at)]
-            vertex = [
-                a >> shift | b << 1 << (31 - shift) for a, b in zip(loaded[:-1], loaded[1:], strict=True)
-            ]
+            shift = bit & 31
+            loaded = [*_rows_at(self.words, header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
+            vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
         return [[vertex[axis] for vertex in found] for axis in range(3)]
 
@@ -247,32 +257,32 @@ def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
     mask = jnp.where(axis.width == 0, jnp.uint32(0), jnp.uint32(0xFFFFFFFF) >> (32 - axis.width & 31))
     number = (lower >> shift | upper << 1 << (31 - shift)) & mask
     whole = (axis.anchor + number).astype(jnp.int32)
-    value = _scaled(whole.astype(jnp.float32), axis.exponent, decode)
+    value = whole.astype(jnp.float32)
     if decode.minus_zero:
         value = jnp.where((axis.mode == 1) & (number == mask), jnp.float32(0), value)
+    if decode.tiny:
+        value = _scaled(value, axis.exponent)
+        return jnp.where(axis.mode == 2, _from_bits(whole, axis.scale_exponent), value)
+    exponent = axis.exponent
     if decode.as_bits:
-        value = jnp.where(axis.mode == 2, _from_bits(whole, axis.scale_exponent, decode), value)
-    return value
+        bits = whole ^ (whole >> 31 & 0x7FFFFFFF)
+        value = jnp.where(axis.mode == 2, lax.bitcast_convert_type(bits, jnp.float32), value)
+        exponent = jnp.where(axis.mode == 2, axis.scale_exponent, exponent)
+    return value * _power_of_two(exponent)
 
 
-def _from_bits(whole: Array, scale_exponent: Array, decode: Decode) -> Array:
-    """Scaled coordinates of mode 2."""
-    bits = jnp.where(whole < 0, whole ^ 0x7FFFFFFF, whole)
-    size = bits & 0x7FFFFFFF
-    if not decode.tiny:
-        return lax.bitcast_convert_type(bits, jnp.float32) * _power_of_two(scale_exponent)
-    # A denormal must not be read as a float: what it is scaled to need not be one.
-    normal = size >= 0x800000
-    exponent = jnp.where(normal, size >> 23, 1) - 150 + scale_exponent
-    mantissa = jnp.where(normal, size & 0x7FFFFF | 0x800000, size).astype(jnp.float32)
-    value = _scaled(mantissa, exponent, decode)
-    return jnp.where(bits < 0, -value, value)
+def _from_bits(whole: Array, scale_exponent: Array) -> Array:
+    """Scaled coordinates of mode 2, by their integers: a denormal must not be read as a float."""
+    bits = jnp.where(whole < 0, ~whole, whole)
+    normal = bits >= 0x800000
+    exponent = jnp.where(normal, bits >> 23, 1) - 150 + scale_exponent
+    mantissa = jnp.where(normal, bits & 0x7FFFFF | 0x800000, bits).astype(jnp.float32)
+    value = _scaled(mantissa, exponent)
+    return jnp.where(whole < 0, -value, value)
 
 
-def _scaled(number: Array, exponent: Array, decode: Decode) -> Array:
-    """A number times a power of two, zero where that is denormal."""
-    if not decode.tiny:
-        return number * _power_of_two(exponent)
+def _scaled(number: Array, exponent: Array) -> Array:
+    """A number times a power of two, in two steps since one may be out of range; zero where denormal."""
     first = jnp.clip(exponent, -126, 127)
     value = number * _power_of_two(first) * _power_of_two(jnp.clip(exponent - first, -126, 127))
     return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, jnp.float32(0), value)
@@ -289,6 +299,11 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
     return jnp.where(last, 2, jnp.where(before(1, 0), 1, 0))
 
 
+def _any(flags: Array) -> Array:
+    """Whether any lane's flag is set."""
+    return folded(jnp.where(flags, jnp.int32(1), jnp.int32(0)), jnp.bitwise_or) != 0
+
+
 def _number(a: Array) -> Array:
     """A small unsigned integer as float32, by way of int32: one instruction."""
     return a.astype(jnp.int32).astype(jnp.float32)
@@ -302,6 +317,22 @@ def _power_of_two(exponent: Array) -> Array:
 def _at(values: Array, places: Array) -> Array:
     """Values at places that are known to be inside."""
     return values.at[places].get(mode="promise_in_bounds")
+
+
+def _rows_at(values: Array, places: Array, count: int) -> list[Array]:
+    """Values at places, at the places behind them, and so on: one gather, which costs as much as one of them."""
+    dimensions = lax.GatherDimensionNumbers(
+        offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,)
+    )
+    inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    rows = lax.gather(values, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
+    return [rows[k] for k in range(count)]
+
+
+def _used_bytes(low: Array, high: Array) -> Array:
+    """The top bit of each byte but of those where low is 1 and high is 0: four slots that are not empty."""
+    other = (low ^ 0x01010101) | high
+    return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & jnp.uint32(0x80808080)
 
 
 def _at_bottom(node: Array, count: int) -> Array:

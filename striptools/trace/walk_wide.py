@@ -8,7 +8,7 @@ from jax import Array, lax
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear, crossing_of, edges_of
-from striptools.trace.walk import WIDTH, Best, Frame, WalkOptions, closer_of
+from striptools.trace.walk import WIDTH, Best, Frame, WalkOptions, replaced
 
 
 class WideScene(NamedTuple):
@@ -36,6 +36,10 @@ class WideScene(NamedTuple):
         """The way from a face to its triangle is on the host."""
         return False
 
+    def faces_of(self, names: Array) -> Array:
+        """Names are faces."""
+        return names
+
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         at = (index(node), jnp.uint32(0), jnp.uint32(0))
@@ -57,7 +61,8 @@ class WideScene(NamedTuple):
         t = crossing_of(edges_of(*(corners(axis) for axis in shear.axes), shear))
         bits = lax.dynamic_slice(self.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
         face = lax.bitcast_convert_type(bits, jnp.int32)
-        return closer_of(best, t, face, face)
+        closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))
+        return replaced(best, closer, t, face)
 
 
 # Notes

@@ -661,6 +661,13 @@ def _block_headers() -> dict[str, tuple[str, list[str], bytes]]:
         "block_vertices_many": many,
         "block_flags": header("a reserved flag of a block", "RDM107", flags=2),
         "block_reserved": header("a reserved field of a block", "RDM107", reserved=0x8000),
+        # Found by the fuzzer, likewise.
+        "word_and_length": wrong(
+            "a block begins where another one does, and zero words are missing",
+            "RDM602 RDM606",
+            Plan(gap),
+            payloads={"BLKD": lambda data: data[:-64]},
+        ),
         "axis_width": wrong("a width of 33 bits", "RDM604", Plan([wide])),
         "axis_mode": header("mode 3", "RDM604", axis_y=2 | 3 << 6),
         "axis_mode_1": wrong("mode 1 without a bit", "RDM604", Plan([minus])),
@@ -881,6 +888,14 @@ def _runs() -> dict[str, tuple[str, list[str], bytes]]:
         "run_over_blocks": of("a run that ends behind its block", "RDM802", (0, 2), (2, 3)),
         "run_too_long": of("a run longer than the longest", "RDM802", *plain[0], record={"longest_run": 1}),
         "run_overlap": of("a triangle in two runs", "RDM803", (0, 2), (1, 1)),
+        # Found by the fuzzer: a validator that stops at the runs does not see what the nodes make of them.
+        "run_gap_and_lost": wrong(
+            "a triangle in no run, and a run that no slot names",
+            "RDM704 RDM803",
+            pair,
+            runs=[[(0, 2), (2, 1)], plain[1]],
+            nodes=[pair.nodes[0], pair.nodes[1]._replace(slots=pair.nodes[1].slots[:1]), pair.nodes[2]],
+        ),
         "run_gap": of("a triangle in no run", "RDM803", (0, 2), (2, 1)),
     }
 
