@@ -263,20 +263,19 @@ def _library(where: str) -> ModuleType:
     return zstandard
 
 
-# Notes
-#
-# What was tried on the dragon, bytes per triangle, lossless / 16 bits, at level 12 of Zstandard:
-# - Indices by how far they are behind the newest one, 0.49; with the ends of open edges beside them, 0.35. Edges
-#   that are looked up in `before` instead of `after` lose the open ones of closing triangles: 0.43.
+# Notes. What was tried on the dragon, bytes per triangle, lossless / 16 bits, at level 12 of Zstandard:
+# - Indices by how far they are behind the newest one, 0.49; with the ends of open edges beside them, 0.35.
+#   Edges that are looked up in `before` instead of `after` lose the open ones of closing triangles: 0.43.
 # - A byte for each way costs 0.30, two bits 0.22: a frame finds more in four ways together.
-# - Places as distances from the newest vertex, 0.144; from the known vertex before, 0.115; from the place of a
-#   corner of the triangle where that is known, 0.114.
-# - Parallelogram, 3.23 / 1.44. Parallelograms about the open edges averaged with it, 3.40 / 1.52; a weaker one,
+# - Places as distances from the newest vertex, 0.144; from the known vertex before, 0.115; from the place of
+#   a corner of the triangle where that is known, 0.114.
+# - Parallelogram, 3.23 / 1.44. Averaged with those about the open edges, 3.40 / 1.52; a weaker one,
 #   (3 (a + b) - 2 o) / 4, 3.37 / 1.47; the middle of an edge for a third vertex, 3.24 / 1.45.
 # - Differences of the bits of float32 in their order, as mode 2 has them: 3.21, but 1.88 for 16 bits.
-# - Classes of sizes with three bits behind the first, and the rest of the bits raw, instead of planes of bytes:
-#   3.15 / 1.41, but models with many equal coordinates lose what repeats: kicad_acepack 1.46 instead of 1.13.
-# - Planes of differences between records instead of the records': headers 0.067 instead of 0.070, nodes and
-#   remap larger. Without the fields that follow from others headers would take 0.058.
-# - Planes of a remap, 1.79 instead of 3.03; of stored nodes, 1.19 instead of 1.34; of runs, 0.20 instead of 0.23.
+# - Classes of sizes with three bits behind the first, and the other bits raw, instead of planes: 3.15 / 1.41,
+#   but what repeats is lost: kicad_acepack takes 1.46 instead of 1.13.
+# - Planes of differences between records: headers 0.069 instead of 0.070, nodes and remap larger. Without the
+#   fields that follow from others headers would take 0.058.
+# - Planes of a remap, 1.79 instead of 3.03; of stored nodes, 1.19 instead of 1.34; of runs, 0.20 instead of
+#   0.23.
 # - Levels 3, 6, 9, 12, 19 of block data: 3.98, 3.94, 3.93, 3.93, 3.86 in 0.06, 0.12, 0.25, 0.5, 4 s.

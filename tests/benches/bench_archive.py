@@ -2,12 +2,13 @@
 
     python tests/benches/bench_archive.py MODEL [MODEL ...] [--record]
 
-A MODEL is a mesh file. It is converted without a remap, lossless and on a grid of 16 bits, and saved raw and
-as an archive; what the archive expands to is compared with the raw file, byte for byte. The peers get the
-same faces in the source's order: meshoptimizer orders them by its vertex cache for strips, which packs
-best, and applies its index and vertex codecs at their best level, then Zstandard; Draco has the same number of bits, and 24, which loses
-some, beside lossless ones. Both hold geometry alone: a hierarchy has to be built anew from what they give
-back. A peer that is not installed (extra `peers`) is left out with a word.
+A MODEL is a mesh file. It is converted without a remap, lossless and on a grid of 16 bits, and saved raw
+and as an archive; what the archive expands to is compared with the raw file, byte for byte. The peers get
+the same faces in the source's order: meshoptimizer orders them by its vertex cache for strips, which
+packs best, and applies its index and vertex codecs at their best level, then Zstandard; Draco has the
+same number of bits, and 24, which loses some, beside lossless ones. Both hold geometry alone: a hierarchy
+has to be built anew from what they give back. A peer that is not installed (extra `peers`) is left out
+with a word.
 
 Seconds are the least of three runs in one process, kernels compiled. Ours include every check that a writer
 and a reader make; expanding ends with a scene whose blocks and hierarchy are checked. `--record` appends the
