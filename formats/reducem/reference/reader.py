@@ -658,7 +658,7 @@ def check_geometries(scene):
         raise RefusedError("4.10", "the first geometry does not begin at block 0 and node 0")
     for i, (row, end) in enumerate(zip(rows, ends, strict=True)):
         blocks, tops = end[0] - row[0], end[1] - row[1]
-        if blocks < 1 or tops < 0 or (tops > 0) != (blocks > 1):
+        if blocks < 1 or end[0] > ends[-1][0] or tops < 0 or (tops > 0) != (blocks > 1):
             raise RefusedError("4.10", f"geometry {i} has {blocks} blocks and {tops} nodes over them")
         triangles = scene.block_starts[end[0]] - scene.block_starts[row[0]]
         if row[2] + row[3] > end[2] or row[3] < triangles:
