@@ -53,9 +53,9 @@ class Tracer:
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
             triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
             same.
-        resident: "expanded" keeps boxes and corners as float32, 80 bytes a triangle; "compressed" keeps the
-            blocks as they are, a tenth of that, and decodes triangles where they are tested, which is
-            slower. Hits are the same. "auto" expands what fits in `memory_budget`.
+        resident: "expanded" keeps boxes and corners as float32, 65 bytes a triangle and more; "compressed"
+            keeps the blocks as they are, 9 bytes and 5 of the remap, and decodes triangles where they are
+            tested, which is slower. Hits are the same. "auto" expands what fits in `memory_budget`.
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
 
