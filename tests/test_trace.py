@@ -53,7 +53,7 @@ def try_every_triangle(scene, origins, directions, t_max=np.inf):
     """Least t, then least face, of every triangle for every ray: (t, face, u, v)."""
     corners, ids, turns = named_corners(scene)
     best = []
-    for o, d in zip(origins * scale_of(scene), directions, strict=True):
+    for o, d in zip(flushed(origins) * scale_of(scene), directions, strict=True):
         best.append(_try_one(corners, ids, turns, o, d, np.float32(t_max) * scale_of(scene)))
     t, face, u, v = (np.array(column) for column in zip(*best, strict=True))
     return (t / scale_of(scene)).astype(np.float32), face, u, v
@@ -78,11 +78,12 @@ def _try_one(corners, ids, turns, o, d, t_max):
 
     a, b, c = edge(2, 1), edge(0, 2), edge(1, 0)
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
+    around = np.all([(q.min(axis=1) <= 0) & (q.max(axis=1) >= 0) for q in (px, py)], axis=0)
     whole = flushed(flushed(a + b) + c)
     t = flushed(rounded(a * height[:, 0]) + rounded(b * height[:, 1])) + rounded(c * height[:, 2])
     t = flushed(t)
     t = np.where(whole < 0, -t, t) / np.abs(whole)
-    hit = np.flatnonzero(inside & (whole != 0) & (t > 0) & (t < t_max) & near(corners, o, d, t))
+    hit = np.flatnonzero(inside & around & (whole != 0) & (t > 0) & (t < t_max) & near(corners, o, d, t))
     if not len(hit):
         return miss
     k = hit[np.lexsort((ids[hit], t[hit]))[0]]

@@ -60,8 +60,8 @@ class Tracer:
             that is free on the device, or on this machine where the device does not tell.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or not both of them together, or the scene
-            has instances, which are not traced compressed yet.
+        UsageError: There is no such device, hierarchy or residency, or not both of them together, or the
+            scene has instances, which are not traced compressed yet.
         LimitError: All instances have more triangles than a mesh may have.
     """
 
