@@ -38,7 +38,7 @@ def section(data, kind):
     [
         ("error_nan", "RDM202", b"SCEN", 32),
         ("cell_high", "RDM206", b"SCEN", 68),
-        ("reserved_3", "RDM107", b"SCEN", 72),
+        ("reserved_2", "RDM107", b"SCEN", 28),
         ("low_minus_zero", "RDM205", b"SCEN", 44),
         ("first_triangle_later", "RDM601", b"BLKH", 32),
         ("word_again", "RDM602", b"BLKH", 36),
