@@ -6,6 +6,7 @@ denormals, and has slow minimum and maximum operations. The functions here say w
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -30,6 +31,20 @@ def rounded(product: Array) -> Array:
     Not a number, and minus infinity, become the lowest finite value.
     """
     return jnp.where(product > LOWEST, product, LOWEST)
+
+
+def quotient(a: Array, b: Array) -> Array:
+    """a / b, rounded correctly on every platform: the same bits.
+
+    A CPU divides so. A GPU's own division may be one or two units off in the last place; that of float64 is
+    right, and rounding its result once more still is, because 53 bits are more than twice 24.
+    """
+    return lax.platform_dependent(a, b, cpu=lax.div, default=_divided_in_double)
+
+
+def _divided_in_double(a: Array, b: Array) -> Array:
+    with jax.enable_x64(True):
+        return (a.astype(jnp.float64) / b.astype(jnp.float64)).astype(jnp.float32)
 
 
 def with_sign_of(a: Array, sign_bit: Array) -> Array:
