@@ -199,8 +199,8 @@ def _jobs(cut: Cut) -> list[tuple[int, int]]:
 # by the most blocks of an aligned range: none fills 68 % of a block, duplicates 1.245 vertices a vertex and
 # costs 1.081; 4: 85 %, 1.224, 1.086; 8: 91 %, 1.220, 1.089; 12: 94 %, 1.2196, 1.093.
 #
-# Edges of more than two faces: tree_japanesemaple has 23,500 edges of four faces and 7,500 of three. Each on top
-# of the one before, effort normal, without flips / with them, vertices per triangle / expected cost:
+# Edges of more than two faces: tree_japanesemaple has 23,500 edges of four faces and 7,500 of three. Each on
+# top of the one before, effort normal, without flips / with them, vertices per triangle / expected cost:
 #
 #   flips alone                                 1.213/1.048   1.197/1.067
 #   an end may leave by the edge of its cut                   1.193/1.067
@@ -211,6 +211,6 @@ def _jobs(cut: Cut) -> list[tuple[int, int]]:
 # So most of what looked like winding was pairs of equal faces linked by the one edge that others needed. A
 # higher price would not have helped (9 and 6 passes in the first row: 1.191). 5,256 components bound it at
 # 1.053. Flips save 0.4 of 13.6 bytes a triangle there, and double the time of ordering; icub, chandelier and
-# ugly_bunny_holes have too few edges of one winding to pay for the bits and stay without. The rest of the table
-# took them from 1.0444 to 1.0439, 1.0580 to 1.0525 and 1.0516 to 1.0514. Meshes of two faces an edge have the
-# strips that they had.
+# ugly_bunny_holes have too few edges of one winding to pay for the bits and stay without. The rest of the
+# table took them from 1.0444 to 1.0439, 1.0580 to 1.0525 and 1.0516 to 1.0514. Meshes of two faces an edge
+# have the strips that they had.
