@@ -78,7 +78,7 @@ def slow_price(mate: np.ndarray, strip_price: int) -> int:
 @given(clean_meshes(), st.sampled_from(EFFORTS), st.integers(1, 5))
 def test_strips_cover_any_mesh_and_decode_to_it(mesh: Mesh, effort, price: int):
     sequences = strips_of(mesh, effort, price)
-    check_sequences(sequences, mesh.faces)
+    check_sequences(sequences, mesh.faces, flips=False)
     strips = encode_strips(mesh.faces, sequences)
     check_strips(strips, mesh.faces)
     for restart in (-1, None):

@@ -395,7 +395,8 @@ def test_info_has_the_names_that_programs_rely_on(run, folder: Path) -> None:
     assert facts["vertices"] == 288
     assert facts["strips"] == scene.strip_count
     assert facts["vertices_per_triangle"] == pytest.approx(1 + 2 * scene.strip_count / 576)
-    assert facts["format_version"] == "0.1"
+    assert facts["format_version"] == "0.2"
+    assert facts["flips"] == 0
     assert facts["precision"] == {"kind": "lossless", "bits": 32, "error_bound": 0.0}
     parts = facts["bytes"]
     total = parts.pop("total")

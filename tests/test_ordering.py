@@ -137,7 +137,7 @@ def test_ordering_equals_the_slow_twin(mesh, options: OrderingOptions):
 @given(clean_meshes(), some_options)
 def test_sequences_hold_every_face_once_within_the_cap(mesh, options: OrderingOptions):
     sequences = order_strips(*prepared(mesh.positions, mesh.faces), options)
-    check_sequences(sequences, mesh.faces, options.max_length)
+    check_sequences(sequences, mesh.faces, options.max_length, flips=False)
 
 
 @pytest.mark.parametrize("max_length", [4, 64])

@@ -29,8 +29,8 @@ def bytes_of(scene):
 
 
 @lru_cache
-def small_bytes():
-    return bytes_of(small_scene())
+def small_bytes(*, flips=False):
+    return bytes_of(small_scene(flips=flips))
 
 
 @pytest.fixture
@@ -38,10 +38,16 @@ def data():
     return small_bytes()
 
 
+@pytest.fixture(params=[False, True], ids=["plain", "flips"])
+def either(request):
+    return small_bytes(flips=request.param)
+
+
 def arrays(scene):
     remap = () if scene.remap is None else (scene.remap.face, scene.remap.rotation)
     hierarchy = (scene.hierarchy.boxes, scene.hierarchy.left_count)
-    return (scene.positions, scene.vertices, scene.turns, scene.starts, *hierarchy, *remap)
+    flips = () if scene.flips is None else (scene.flips,)
+    return (scene.positions, scene.vertices, scene.turns, *flips, scene.starts, *hierarchy, *remap)
 
 
 def errors(data):
@@ -87,11 +93,11 @@ def test_a_scene_comes_back_bit_for_bit(case):
     assert bytes_of(again) == data
 
 
-def test_path_stream_and_bytes_read_alike(data, tmp_path):
+def test_path_stream_and_bytes_read_alike(either, tmp_path):
     path = tmp_path / "small.rdm"
-    path.write_bytes(data)
-    for source in (path, str(path), data, bytearray(data), memoryview(data), io.BytesIO(data)):
-        assert bytes_of(read_scene(source)) == data
+    path.write_bytes(either)
+    for source in (path, str(path), either, bytearray(either), memoryview(either), io.BytesIO(either)):
+        assert bytes_of(read_scene(source)) == either
         if isinstance(source, io.BytesIO):
             source.seek(0)
         assert validate(source) == []
@@ -113,7 +119,10 @@ def test_saving_to_a_path_and_to_a_stream_gives_the_same_bytes(data, tmp_path):
 
 def test_every_section_is_aligned_and_named_once(data):
     rows = table_of(data)
-    assert [row[0] for row in rows] == [section.kind for section in layout.SECTIONS]
+    kinds = [section.kind for section in layout.SECTIONS if section is not layout.FLIPS]
+    assert [row[0] for row in rows] == kinds
+    flipped = table_of(small_bytes(flips=True))
+    assert [row[0] for row in flipped] == [section.kind for section in layout.SECTIONS]
     assert all(row[2] % 64 == 0 and row[3] > 0 for row in rows)
     assert len(data) % 64 == 0
 
@@ -122,9 +131,9 @@ def test_the_remap_and_an_empty_hierarchy_are_left_out():
     assert b"RMAP" not in [row[0] for row in table_of(bytes_of(small_scene(remap=False)))]
 
 
-def test_every_prefix_is_refused(data):
-    for length in range(len(data)):
-        assert verdict(data[:length]) in {"RDM101", "RDM102", "RDM104"}
+def test_every_prefix_is_refused(either):
+    for length in range(len(either)):
+        assert verdict(either[:length]) in {"RDM101", "RDM102", "RDM104"}
 
 
 def test_every_extra_byte_is_refused(data):
@@ -132,23 +141,23 @@ def test_every_extra_byte_is_refused(data):
         assert verdict(data + bytes([byte])) == "RDM104"
 
 
-def test_every_flipped_bit_is_refused(data):
-    for at in range(len(data)):
+def test_every_flipped_bit_is_refused(either):
+    for at in range(len(either)):
         for bit in range(8):
-            flipped = bytearray(data)
+            flipped = bytearray(either)
             flipped[at] ^= 1 << bit
             assert verdict(bytes(flipped)) is not None, (at, bit)
 
 
-def test_every_flipped_bit_under_right_checksums_is_refused_or_a_scene(data):
+def test_every_flipped_bit_under_right_checksums_is_refused_or_a_scene(either):
     accepted = 0
-    for at in range(len(data)):
+    for at in range(len(either)):
         if 28 <= at < 32:
             continue
         for bit in range(8):
-            flipped = bytearray(data)
+            flipped = bytearray(either)
             flipped[at] ^= 1 << bit
-            if 12 <= at < 16 and struct.unpack_from("<I", flipped, 12)[0] * 32 + 32 > len(data):
+            if 12 <= at < 16 and struct.unpack_from("<I", flipped, 12)[0] * 32 + 32 > len(either):
                 assert verdict(bytes(flipped)) == "RDM105"
                 continue
             accepted += verdict(with_checksums(flipped)) is None
@@ -216,6 +225,35 @@ def test_a_section_that_is_longer_shorter_twice_or_wrongly_flagged_is_refused(da
     assert verdict(repacked(data, lambda rows: rows.append(rows[at]))) == "RDM112"
 
 
+def with_flips(data, payload):
+    def change(rows):
+        rows[:] = [row for row in rows if row[0] != b"FLIP"] + [[b"FLIP", 1, payload]]
+
+    return repacked(data, change)
+
+
+def test_each_rule_of_flip_bits_has_its_code():
+    data = small_bytes(flips=True)
+    (good,) = (data[row[2] : row[2] + row[3]] for row in table_of(data) if row[0] == b"FLIP")
+    assert verdict(with_flips(data, good)) is None
+    assert verdict(with_flips(data, bytes([good[0], good[1] | 0x20]))) == "RDM309"
+    assert verdict(with_flips(data, bytes([good[0] | 1, good[1]]))) == "RDM310"
+    assert verdict(with_flips(data, bytes(2))) == "RDM311"
+    assert verdict(with_flips(data, good + bytes(1))) == "RDM114"
+    unflagged = repacked(data, lambda rows: rows[4].__setitem__(1, 0))
+    assert table_of(unflagged)[4][0] == b"FLIP"
+    assert verdict(unflagged) == "RDM116"
+
+
+def test_a_file_without_flip_bits_is_a_scene_of_one_winding():
+    assert read_scene(small_bytes()).flips is None
+    flipped = read_scene(small_bytes(flips=True))
+    assert flipped.flips.any()
+    dropped = repacked(small_bytes(flips=True), lambda rows: rows.pop(4))
+    assert verdict(dropped) is None
+    assert (read_scene(dropped).faces() != flipped.faces()).any(axis=1).tolist() == flipped.flips.tolist()
+
+
 def test_an_empty_section_and_too_many_sections_are_refused(data):
     assert verdict(repacked(data, lambda rows: rows.append([b"XTRA", 0, b""]))) == "RDM109"
     many = repacked(data, lambda rows: rows.extend([[b"%04d" % k, 0, b"x"] for k in range(64)]))
@@ -226,7 +264,7 @@ def test_the_order_of_sections_is_free(data):
     assert bytes_of(read_scene(repacked(data, list.reverse))) == data
 
 
-@pytest.mark.parametrize("version", [(0, 0), (0, 2), (1, 0), (65535, 1)])
+@pytest.mark.parametrize("version", [(0, 1), (0, 3), (1, 0), (65535, 2)])
 def test_another_version_is_refused_by_name(data, version):
     other = with_checksums(data[:8] + struct.pack("<HH", *version) + data[12:])
     with pytest.raises(UnreadableSceneError, match=rf"version {version[0]}\.{version[1]}.*RDM103"):

@@ -30,17 +30,17 @@ def turned_to_least_corner(rows):
     return sorted(turned)
 
 
-@given(clean_meshes(), st.sampled_from([1, 3, 64]), st.integers(0, 3))
-def test_with_a_remap_the_source_comes_back_face_by_face_and_corner_by_corner(mesh, max_length, spare):
-    back = scene_of(mesh, max_length=max_length, spare_faces=spare).to_mesh()
+@given(clean_meshes(), st.sampled_from([1, 3, 64]), st.integers(0, 3), st.booleans())
+def test_with_a_remap_the_source_comes_back_face_by_face_and_corner_by_corner(mesh, max_length, spare, flips):
+    back = scene_of(mesh, max_length=max_length, spare_faces=spare, flips=flips).to_mesh()
     np.testing.assert_array_equal(
         corners(back.positions, back.faces), corners(mesh.positions, mesh.faces), strict=True
     )
 
 
-@given(clean_meshes())
-def test_without_one_every_face_comes_back_once_and_none_reflected(mesh):
-    back = scene_of(mesh, remap=False).to_mesh()
+@given(clean_meshes(), st.booleans())
+def test_without_one_every_face_comes_back_once_and_none_reflected(mesh, flips):
+    back = scene_of(mesh, remap=False, flips=flips).to_mesh()
     assert turned_to_least_corner(corners(back.positions, back.faces)) == turned_to_least_corner(
         corners(mesh.positions, mesh.faces)
     )
@@ -72,7 +72,7 @@ def test_positions_that_no_strip_uses_are_left_out():
 
     class Shifted:
         vertices = scene.vertices + np.int32(2)
-        turns, starts = scene.turns, scene.starts
+        turns, flips, starts = scene.turns, None, scene.starts
         source_face = np.arange(scene.triangle_count)
         rotation = np.zeros(scene.triangle_count, np.uint8)
 
@@ -117,6 +117,8 @@ FAULTS = {
     "RDM306": swapped_positions,
     "RDM307": lambda s: replace(s, positions=np.concatenate([s.positions, s.positions[:1]])),
     "RDM308": lambda s: replace(s, vertices=changed(s.vertices, -1, s.vertices[-2])),
+    "RDM310": lambda s: replace(s, flips=np.ones(s.triangle_count, np.bool_)),
+    "RDM311": lambda s: replace(s, flips=np.zeros(s.triangle_count, np.bool_)),
     "RDM401": lambda s: replace(
         s, hierarchy=replace(s.hierarchy, left_count=changed(s.hierarchy.left_count, 0, 0))
     ),
@@ -154,6 +156,12 @@ def test_a_remap_of_another_length_is_found():
     scene = small_scene()
     with pytest.raises(StriptoolsError, match="RDM114"):
         check_scene(replace(scene, remap=Remap(scene.remap.face[:-1], scene.remap.rotation[:-1])))
+
+
+def test_flip_bits_of_another_length_are_found():
+    scene = small_scene(flips=True)
+    with pytest.raises(StriptoolsError, match="RDM114"):
+        check_scene(replace(scene, flips=scene.flips[:-1]))
 
 
 def test_a_real_model_comes_back(real_mesh, tmp_path):

@@ -71,7 +71,7 @@ def test_the_sections_are_the_specifications_table():
         (section.kind, section.must_understand) for section in layout.SECTIONS
     ]
     for n, v, s in [(1, 3, 1), (13, 15, 4), (1000, 700, 33)]:
-        lengths = layout.section_lengths(n, v, s, remap=True)
+        lengths = layout.section_lengths(n, v, s, flips=True, remap=True)
         assert [LENGTHS[row[2]](n, v, s) for row in rows] == list(lengths.values())
 
 
@@ -119,7 +119,7 @@ def test_the_decoding_of_the_specification_gives_the_same_triangles():
         for t in range(scene.starts[i] + 1, scene.starts[i + 1]):
             w = scene.vertices[at + 2 + t - scene.starts[i]]
             a, b, c = (a, c, w) if scene.turns[t] else (c, b, w)
-            emitted.append((a, b, c))
+            emitted.append((b, a, c) if scene.flips[t] else (a, b, c))
     np.testing.assert_array_equal(emitted, scene.faces())
 
 

@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from math import frexp, log2
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import book, clean_meshes, fan, grid, soup, sphere, stack
+from strategies import book, clean_meshes, fan, grid, soup, sphere, stack, tangle
 
 from striptools.errors import UsageError
 from striptools.kernels import strip_chunks, strip_tunnels
@@ -19,7 +20,7 @@ from striptools.partition.object_split import ObjectTree, split_objects
 from striptools.partition.sah import half_area
 from striptools.strips.linking import link_faces
 from striptools.strips.ordering import METHODS, OrderingOptions, Sequences
-from striptools.strips.stripify import cut_for, order_cut, stripify
+from striptools.strips.stripify import TRIANGLES_A_STRIP, cut_for, order_cut, stripify
 from striptools.strips.topology import check_sequences, check_strips, encode_strips
 from striptools.strips.tunnelling import EFFORTS, Effort
 
@@ -92,7 +93,7 @@ def test_linking_equals_the_slow_twin(mesh, most: int):
     # Rings that hold more than one pair are walked in another order by face numbers than by places.
     if all(ring_is_pair(adjacency.ring, h) for h in range(3 * len(faces))):
         assert as_lists(linked) == slow_linking(mesh.positions, mesh.faces, most)
-    check_sequences(linked, faces, most)
+    check_sequences(linked, faces, most, flips=False)
 
 
 def ring_is_pair(ring: np.ndarray, h: int) -> bool:
@@ -123,18 +124,20 @@ def slow_cost(boxes: np.ndarray) -> float:
     return inner(boxes) + strip_tunnels.TOP_WEIGHT * area(boxes)
 
 
-@given(clean_meshes(), caps, efforts)
-def test_the_costs_that_tunnels_keep_are_those_of_the_strips_they_leave(mesh, most: int, effort: Effort):
+@given(clean_meshes(), caps, efforts, st.booleans())
+def test_the_costs_that_tunnels_keep_are_those_of_the_strips_they_leave(
+    mesh, most: int, effort: Effort, flips: bool
+):
     faces, vertices, boxes, tree = prepared(mesh.positions, mesh.faces)
     order, first = np.zeros(len(faces), np.int32), np.zeros(len(faces), np.bool_)
     given_tree = (tree.order, tree.leaf_node, tree.parent, tree.size, cut_tree(tree, 10**6).starts)
     number = np.full(vertices, -1, np.int32)
-    before, after = strip_chunks.order_ranges(
-        faces, boxes, *given_tree, 0, 1, most, effort.numbers, number, order, first
+    before, after, _ = strip_chunks.order_ranges(
+        faces, boxes, *given_tree, 0, 1, most, effort.numbers, flips, number, order, first
     )
     assert (number == -1).all()
     starts = np.append(np.flatnonzero(first), len(faces)).astype(np.int32)
-    check_sequences(Sequences(order, starts), faces, most)
+    check_sequences(Sequences(order, starts), faces, most, flips=flips)
     scale = 2.0 ** -frexp(float(np.abs(boxes).max()))[1]
     parts = np.split(boxes[order].astype(np.float64) * scale, starts[1:-1])
     leaves = half_area(boxes.astype(np.float64) * scale).sum()
@@ -157,7 +160,11 @@ def test_tunnels_never_make_more_strips(mesh, most: int, effort: Effort):
 def test_every_method_gives_sequences_within_the_cap(mesh, method, most: int, block: int | None):
     one = prepared(mesh.positions, mesh.faces)
     options = OrderingOptions(most, method, block=block)
-    check_sequences(stripify(*one, options, threads=2), mesh.faces, most)
+    flips = method == "strip-rt"
+    check_sequences(stripify(*one, options, threads=2), mesh.faces, most, flips=flips)
+    without = stripify(*one, replace(options, flips=False))
+    check_sequences(without, mesh.faces, most, flips=False)
+    assert len(stripify(*one, options).starts) <= len(without.starts)
 
 
 @given(clean_meshes(), st.sampled_from([4, 16, 64]))
@@ -178,6 +185,92 @@ def test_strips_do_not_depend_on_the_number_of_threads():
     for run in runs[1:]:
         assert np.array_equal(run.faces, runs[0].faces)
         assert np.array_equal(run.starts, runs[0].starts)
+
+
+@given(clean_meshes(), caps, efforts, st.sampled_from([8, 10**6]))
+def test_flips_never_cost_more_than_they_save(mesh, most: int, effort: Effort, chunk: int):
+    one = prepared(mesh.positions, mesh.faces)
+    cut = cut_tree(one[3], chunk)
+    plain, flipped = (order_cut(*one, cut, most, effort, flips=flips) for flips in (False, True))
+    strips = encode_strips(one[0], flipped)
+    check_strips(strips, one[0])
+    if strips.flips is None:
+        assert as_lists(flipped) == as_lists(plain)
+    else:
+        assert (len(plain.starts) - len(flipped.starts)) * TRIANGLES_A_STRIP > len(one[0])
+
+
+@given(st.integers(3, 8), st.integers(1, 60), st.integers(0, 2**32 - 1))
+def test_rows_with_repeated_vertices_are_never_flipped_in_two_ways(vertices: int, count: int, seed: int):
+    positions, faces = tangle(vertices, count, seed)
+    one = prepared(positions, faces)
+    for effort in (None, EFFORTS["best"]):
+        strips = encode_strips(faces, order_cut(*one, cut_tree(one[3], 10**6), 64, effort))
+        check_strips(strips, faces)
+
+
+def moebius(quads: int) -> Arrays:
+    """A band of one winding with a half twist: no orientation fits all the way round."""
+    angle = np.arange(quads) * (2 * np.pi / quads)
+    half = np.stack([np.cos(angle / 2), np.sin(angle / 2)], axis=1) * 0.4
+    rim = [
+        np.stack(
+            [(1 + s * half[:, 0]) * np.cos(angle), (1 + s * half[:, 0]) * np.sin(angle), s * half[:, 1]],
+            axis=1,
+        )
+        for s in (-1, 1)
+    ]
+    k = np.arange(quads)
+    low, high = k, k + quads
+    next_low, next_high = np.append(low[1:], quads), np.append(high[1:], 0)
+    one = np.stack([low, next_low, high], axis=1)
+    two = np.stack([next_low, next_high, high], axis=1)
+    return np.concatenate(rim).astype(np.float32), np.stack([one, two], 1).reshape(-1, 3).astype(np.int32)
+
+
+def fewest_strips(mesh: Arrays) -> tuple[int, int]:
+    """How many strips a mesh takes with flips and without."""
+    one = prepared(*mesh)
+    counts = []
+    for flips in (True, False):
+        sequences = stripify(*one, OrderingOptions(max_length=2**30, flips=flips))
+        check_strips(encode_strips(one[0], sequences, flips=flips), one[0])
+        counts.append(len(sequences.lengths))
+    return counts[0], counts[1]
+
+
+@pytest.mark.parametrize(("copies", "rings"), [(1, 1), (2, 1), (5, 1), (25, 6)])
+def test_faces_on_one_another_run_the_same_way_are_a_strip_a_ring(copies: int, rings: int):
+    positions, faces = np.eye(3, dtype=np.float32), np.tile(np.array([[0, 1, 2]], np.int32), (copies, 1))
+    assert fewest_strips((positions, faces)) == (rings, copies)
+
+
+@pytest.mark.parametrize("pages", [2, 3, 5, 26])
+def test_pages_run_the_same_way_pair_up(pages: int):
+    positions, faces = book(pages)
+    faces[1::2, :2] = faces[1::2, 1::-1]
+    assert fewest_strips((positions, faces)) == ((pages + 1) // 2, pages)
+
+
+def test_a_moebius_band_is_a_strip_with_and_without_flips():
+    assert fewest_strips(moebius(20)) == (1, 1)
+
+
+def test_a_grid_of_random_windings_is_as_good_as_a_grid():
+    positions, faces = flipped(2000)
+    with_flips, without = fewest_strips((positions, faces))
+    straight, _ = fewest_strips(grid(int(1000**0.5), int(1000**0.5)))
+    assert without > 10 * with_flips
+    assert with_flips <= straight + 5
+
+
+def test_strips_with_flips_do_not_depend_on_the_number_of_threads():
+    positions, faces = flipped(45_000)
+    one = prepared(positions, faces)
+    cut = cut_tree(one[3], 2000)
+    runs = [order_cut(*one, cut, 64, EFFORTS["normal"], threads) for threads in (1, 2)]
+    assert encode_strips(faces, runs[0]).flips is not None
+    assert as_lists(runs[0]) == as_lists(runs[1])
 
 
 def test_progress_rises_between_zero_and_one():

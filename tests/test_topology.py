@@ -22,6 +22,7 @@ from striptools.strips.topology import (
     decode_strips,
     decode_triangle,
     encode_strips,
+    without_flips,
 )
 
 
@@ -35,10 +36,10 @@ def strips_of(positions: np.ndarray, faces: np.ndarray, max_length: int = 64) ->
 
 
 def decoded(strips: Strips) -> np.ndarray:
-    return decode_strips(strips.vertices, strips.turns, strips.starts)
+    return decode_strips(strips.vertices, strips.turns, strips.starts, strips.flips)
 
 
-def slow_decode(vertices, turns, starts) -> list[tuple[int, int, int]]:
+def slow_decode(vertices, turns, starts, flips=None) -> list[tuple[int, int, int]]:
     """Triangle after triangle by the rule in the head of strips/topology.py."""
     rows = []
     for strip in range(len(starts) - 1):
@@ -51,7 +52,8 @@ def slow_decode(vertices, turns, starts) -> list[tuple[int, int, int]]:
                 a, b, c = a, c, w
             else:
                 a, b, c = c, b, w
-            rows.append((int(a), int(b), int(c)))
+            first, second = (b, a) if flips is not None and flips[k] else (a, b)
+            rows.append((int(first), int(second), int(c)))
     return rows
 
 
@@ -74,7 +76,10 @@ def any_strips(draw: st.DrawFn) -> Strips:
     turns = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)), np.bool_)
     turns[starts[:-1]] = False
     vertices = np.arange(count + 2 * len(lengths), dtype=np.int32)
-    return Strips(vertices, turns, starts, np.arange(count, dtype=np.int32), np.zeros(count, np.uint8))
+    flips = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)), np.bool_)
+    flips[starts[:-1]] = False
+    source = np.arange(count, dtype=np.int32), np.zeros(count, np.uint8)
+    return Strips(vertices, turns, starts, *source, flips if flips.any() else None)
 
 
 @given(clean_meshes(), st.sampled_from([1, 2, 3, 64, 1000]))
@@ -107,14 +112,96 @@ def test_strips_take_two_vertices_more_than_triangles_and_leave_unused_bits_clea
 @given(any_strips())
 def test_decode_equals_the_slow_twin_for_any_turns(strips: Strips):
     assert [tuple(row) for row in decoded(strips).tolist()] == slow_decode(
-        strips.vertices, strips.turns, strips.starts
+        strips.vertices, strips.turns, strips.starts, strips.flips
     )
 
 
 @given(any_strips())
 def test_each_triangle_can_be_read_alone(strips: Strips):
     for triangle, row in enumerate(decoded(strips).tolist()):
-        assert decode_triangle(strips.vertices, strips.turns, strips.starts, triangle) == tuple(row)
+        alone = decode_triangle(strips.vertices, strips.turns, strips.starts, triangle, strips.flips)
+        assert alone == tuple(row)
+
+
+@given(any_strips())
+def test_what_is_decoded_is_encoded_alike(strips: Strips):
+    faces = decoded(strips)
+    again = encode_strips(faces, Sequences(strips.source_face, strips.starts))
+    check_strips(again, faces)
+    # The first triangle may be turned anew, and no other differs from its face.
+    assert np.array_equal(decoded(again)[again.rotation == 0], faces[again.rotation == 0])
+    assert flips_of(again).tolist() == flips_of(strips).tolist()
+
+
+def flips_of(strips: Strips) -> np.ndarray:
+    return np.zeros(len(strips.turns), np.bool_) if strips.flips is None else strips.flips
+
+
+@given(any_strips())
+def test_strips_without_flips_are_the_same_triangles_cut_where_the_winding_changes(strips: Strips):
+    faces = decoded(strips)
+    cut = without_flips(strips)
+    assert cut.flips is None
+    check_strips(cut, faces)
+    assert cut.source_face.tolist() == strips.source_face.tolist()
+    changes = np.flatnonzero(np.diff(flips_of(strips).astype(int))) + 1
+    assert cut.starts.tolist() == sorted({*strips.starts.tolist(), *changes.tolist()})
+
+
+@given(clean_meshes(), st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 3, 64]))
+def test_faces_may_be_turned_over_at_will_and_stay_in_their_strips(mesh, seed: int, max_length: int):
+    sequences = sequences_of(mesh.positions, mesh.faces, max_length)
+    straight = encode_strips(mesh.faces, sequences)
+    assert straight.flips is None
+    over = np.random.default_rng(seed).random(len(mesh.faces)) < 0.5
+    faces = np.where(over[:, None], mesh.faces[:, ::-1], mesh.faces)
+    check_sequences(sequences, faces)
+    strips = encode_strips(faces, sequences)
+    check_strips(strips, faces)
+    # A face is flipped where it is turned over against the first of its strip.
+    turned = over[sequences.faces]
+    firsts = np.repeat(turned[sequences.starts[:-1]], sequences.lengths)
+    assert flips_of(strips).tolist() == (turned != firsts).tolist()
+    for triangle, row in enumerate(decoded(strips).tolist()):
+        alone = decode_triangle(strips.vertices, strips.turns, strips.starts, triangle, strips.flips)
+        assert alone == tuple(row)
+
+
+@given(clean_meshes(), st.integers(0, 2**32 - 1))
+def test_flips_are_refused_where_they_are_forbidden(mesh, seed: int):
+    sequences = sequences_of(mesh.positions, mesh.faces)
+    over = np.random.default_rng(seed).random(len(mesh.faces)) < 0.5
+    faces = np.where(over[:, None], mesh.faces[:, ::-1], mesh.faces)
+    if encode_strips(faces, sequences).flips is None:
+        check_sequences(sequences, faces, flips=False)
+        return
+    with pytest.raises(UsageError, match="does not continue"):
+        encode_strips(faces, sequences, flips=False)
+    with pytest.raises(UsageError, match="does not continue"):
+        check_sequences(sequences, faces, flips=False)
+
+
+def test_flips_do_not_depend_on_the_number_of_threads():
+    positions, faces = grid(150, 150)
+    sequences = sequences_of(positions, faces)
+    faces = np.where(np.random.default_rng(3).random(len(faces))[:, None] < 0.5, faces[:, ::-1], faces)
+    one, two = (encode_strips(faces, sequences, threads) for threads in (1, 2))
+    for name in ("vertices", "turns", "rotation", "flips"):
+        assert np.array_equal(getattr(one, name), getattr(two, name))
+    whole = decode_strips(one.vertices, one.turns, one.starts, one.flips, threads=2)
+    assert np.array_equal(whole, decoded(one))
+
+
+def test_a_worked_example_of_flips():
+    # The squares of the example below, the second triangle turned over.
+    faces = np.array([[0, 1, 3], [3, 4, 1], [1, 2, 4], [2, 5, 4]], np.int32)
+    strips = encode_strips(faces, Sequences(np.arange(4, dtype=np.int32), np.array([0, 4], np.int32)))
+    assert strips.vertices.tolist() == [0, 1, 3, 4, 2, 5]
+    assert strips.turns.tolist() == [False, False, False, True]
+    assert strips.flips is not None
+    assert strips.flips.tolist() == [False, True, False, False]
+    assert decoded(strips).tolist() == [[0, 1, 3], [1, 3, 4], [4, 1, 2], [4, 2, 5]]
+    assert strips.rotation.tolist() == [0, 2, 2, 2]
 
 
 @given(any_strips(), st.sampled_from([-1, 10**6]))
@@ -124,6 +211,8 @@ def test_classic_strips_of_any_turns_decode_to_the_same_triangles(strips: Strips
         decode_classic(classic_strips(strips, None)),
     ):
         assert sorted_rows(rows) == sorted_rows(decoded(strips))
+    for index in (restart, None):
+        assert count_classic(strips, index).indices == len(classic_strips(strips, index))
 
 
 @given(clean_meshes())
@@ -144,6 +233,7 @@ def slow_repeats(turns: list[bool]) -> tuple[int, int]:
 
 @given(any_strips(), st.sampled_from([-1, None]))
 def test_the_count_of_classic_strips_is_exact_and_no_more_than_the_slow_twins(strips: Strips, restart):
+    strips = replace(strips, flips=None)
     count = count_classic(strips, restart)
     assert count.indices == len(classic_strips(strips, restart))
     between = count.restarts if restart is not None else 2 * (max(len(strips.starts) - 2, 0) - count.joins)
@@ -212,6 +302,8 @@ def test_decode_refuses_arrays_that_do_not_belong_together():
     for starts in (strips.starts[:-1], strips.starts[::-1], strips.starts[:0], np.repeat(strips.starts, 2)):
         with pytest.raises(UsageError, match="starts"):
             decode_strips(strips.vertices, strips.turns, starts)
+    with pytest.raises(UsageError, match="flip bits"):
+        decode_strips(strips.vertices, strips.turns, strips.starts, strips.turns[1:])
 
 
 def test_classic_strips_refuse_what_they_cannot_hold():
@@ -241,6 +333,10 @@ def test_check_strips_finds_each_fault():
         "once": changed("source_face", 3, good.source_face[4]),
         "starts": changed("starts", 1, 0),
         "vertices": replace(good, vertices=good.vertices[:-1]),
+        "flip bits": replace(good, flips=good.turns[:-1]),
+        "but no flip": replace(good, flips=np.zeros_like(good.turns)),
+        "first triangle is flipped": replace(good, flips=np.ones_like(good.turns)),
+        "1 is not its source face": replace(good, flips=np.arange(len(good.turns)) == 1),
     }
     for what, faulty in faults.items():
         with pytest.raises(UsageError, match=what):

@@ -92,6 +92,13 @@ def run(
             show_default="no blocks",
         ),
     ] = _ORDER.block,
+    flips: Annotated[
+        bool,
+        typer.Option(
+            "--flips/--no-flips",
+            help="Let strips cross edges that both faces run the same way, where it pays (strip-rt).",
+        ),
+    ] = _ORDER.flips,
     distance_weight: Annotated[
         float, typer.Option(min=0.0, metavar="W", help="Weight of nearness when strips join (paper).")
     ] = _ORDER.distance_weight,
@@ -137,6 +144,7 @@ def run(
             distance_weight,
             balance_weight,
             block,
+            flips,
         ),
         remap=not no_remap,
         threads=threads,

@@ -19,7 +19,8 @@ def run(
     """Say what is in a scene file, and how many bytes each part takes.
 
     `vertices` counts stored positions, `vertices_per_triangle` the entries of the strips: n + 2 for
-    a strip of n triangles. `bytes_per_triangle` is what tracing needs, so every part but the remap.
+    a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
+    what tracing needs, so every part but the remap.
     """
     log.set_up()
     file = Source.open(source)
@@ -34,6 +35,7 @@ def describe(scene: Scene) -> dict[str, object]:
         "triangles": triangles,
         "vertices": scene.vertex_count,
         "strips": scene.strip_count,
+        "flips": 0 if scene.flips is None else int(scene.flips.sum()),
         "triangles_per_strip": triangles / scene.strip_count,
         "strip_vertices": len(scene.vertices),
         "vertices_per_triangle": len(scene.vertices) / triangles,

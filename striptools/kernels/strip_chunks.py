@@ -65,7 +65,7 @@ def gather_boxes(boxes, order, begin, end, gathered):
 
 
 @njit(cache=True, nogil=True)
-def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, starts):
+def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, flips, order, starts):
     """Improve linked faces by tunnels and write them in strip order; returns strips, cost before and after.
 
     Args:
@@ -77,6 +77,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
         leaves: The sum of the boxes' half areas.
         most: The most faces of a strip.
         effort: rotations, neutral rotations, price, rise, passes.
+        flips: Whether strips may cross edges that both faces run the same way.
         order: (n,) int32 to fill with faces.
         starts: (n + 1,) int32 to fill with the first place of each strip.
     """
@@ -98,7 +99,7 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
         for place in range(strips.length[s]):
             strips.where[rows[strips.begin[s] + place], 0] = s
             strips.where[rows[strips.begin[s] + place], 1] = place
-    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32))
+    ground = Ground(ring, faces, boxes, mirrors(), np.empty((LONGEST, 6), np.float32), flips)
     before, after = search_range(strips, ground, most, deepest, neutral, price, rise, passes, leaves)
     # Write the strips by the place of their first faces, each turned the cheaper way.
     k = 0
@@ -128,7 +129,21 @@ def tunnel_range(ring, faces, boxes, mate, links, leaves, most, effort, order, s
 
 @njit(cache=True, nogil=True)
 def order_ranges(
-    faces, boxes, order, leaf_node, parent, size, starts, first, last, most, effort, number, placed, is_first
+    faces,
+    boxes,
+    order,
+    leaf_node,
+    parent,
+    size,
+    starts,
+    first,
+    last,
+    most,
+    effort,
+    flips,
+    number,
+    placed,
+    is_first,
 ):
     """Order the faces of the ranges first:last of a cut into strips.
 
@@ -144,12 +159,17 @@ def order_ranges(
         last: The first range not to do.
         most: The most faces of a strip.
         effort: rotations (negative: link only), neutral rotations, price, rise, passes.
+        flips: Whether strips may cross edges that both faces run the same way.
         number: (v,) int32, -1 everywhere before and after: this thread's own.
         placed: (n,) int32 to fill with the faces in strip order, in these ranges.
         is_first: (n,) bool to fill with whether a strip starts there, in these ranges.
+
+    Returns:
+        The cost of all ranges after linking and at the end, and the half-edges that `link_range` refused.
     """
     before = 0.0
     after = 0.0
+    refused = 0
     for k in range(first, last):
         begin = starts[k]
         end = starts[k + 1]
@@ -164,7 +184,7 @@ def order_ranges(
         # Link, then tunnel.
         mate = np.empty(3 * count, np.int32)
         links = np.empty(count, np.uint8)
-        link_range(ring, here, leaf, parent, size, most, mate, links)
+        refused += link_range(ring, here, leaf, parent, size, most, flips, mate, links)
         row = np.empty(count, np.int32)
         first_places = np.empty(count + 1, np.int32)
         if effort[0] < 0:
@@ -173,7 +193,7 @@ def order_ranges(
             scaled = np.empty((count, 6), np.float32)
             leaves = gather_boxes(boxes, order, begin, end, scaled)
             strips, was, became = tunnel_range(
-                ring, here, scaled, mate, links, leaves, most, effort, row, first_places
+                ring, here, scaled, mate, links, leaves, most, effort, flips, row, first_places
             )
             before += was
             after += became
@@ -183,4 +203,4 @@ def order_ranges(
             is_first[begin + i] = False
         for s in range(strips):
             is_first[begin + first_places[s]] = True
-    return before, after
+    return before, after, refused

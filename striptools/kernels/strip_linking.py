@@ -7,8 +7,10 @@ half-edge, or -1; `links` (n,) uint8 the links of each face.
 import numpy as np
 from numba import njit
 
-CLASSES = 64
-"""Two classes an octave of subtree sizes: more than any int32 size needs."""
+from striptools.kernels.strip_topology import may_flip
+
+CLASSES = 128
+"""Two classes an octave of subtree sizes, each for edges of two faces and of more."""
 
 
 @njit(cache=True, nogil=True)
@@ -28,8 +30,16 @@ def common_size(a, b, parent, size):
     return size[a]
 
 
+@njit(cache=True, nogil=True, forceinline=True)
+def may_link(faces, h, g, flips):
+    """Whether half-edges h and g of one edge may be linked: run in opposite directions, or with a flip."""
+    if faces[h // 3, h % 3] != faces[g // 3, g % 3]:
+        return True
+    return flips and may_flip(faces, h // 3, g // 3)
+
+
 @njit(cache=True, nogil=True)
-def link_range(ring, faces, leaf, parent, size, most, mate, links):
+def link_range(ring, faces, leaf, parent, size, most, flips, mate, links):
     """Link the faces of a range into paths of at most `most` faces, the nearest in the tree first.
 
     Args:
@@ -39,22 +49,33 @@ def link_range(ring, faces, leaf, parent, size, most, mate, links):
         parent: The tree's.
         size: The tree's.
         most: The most faces of a path.
+        flips: Whether to link through edges that both faces run the same way, too.
         mate: (3n,) int32 to fill.
         links: (n,) uint8 to fill.
+
+    Returns:
+        How many half-edges are followed on their ring by one that they must not be linked to, for the winding
+        of their faces alone: those that no half-edge is left for, more or less.
     """
     count = faces.shape[0]
     half_edges = 3 * count
     mate[:] = -1
     links[:] = 0
-    # Give every pair of half-edges that run an edge in opposite directions the class of its common node.
+    # Give every pair of half-edges that may be linked the class of its common node.
     first = np.zeros(CLASSES + 1, np.int32)
-    pair_class = np.empty(half_edges + half_edges // 4 + 8, np.uint8)
+    pair_class = np.empty(2 * half_edges, np.uint8)
     pairs = 0
+    refused = 0
     for h in range(half_edges):
         g = ring[h]
         while g != h:
-            if g > h and g // 3 != h // 3 and faces[h // 3, h % 3] != faces[g // 3, g % 3]:
-                c = size_class(common_size(leaf[h // 3], leaf[g // 3], parent, size))
+            if g > h and g // 3 != h // 3:
+                if not may_link(faces, h, g, flips):
+                    refused += (ring[h] == g) + (ring[g] == h)
+                    g = ring[g]
+                    continue
+                common = common_size(leaf[h // 3], leaf[g // 3], parent, size)
+                c = 2 * size_class(common) + (ring[g] != h or ring[h] != g)
                 pair_class[pairs] = c
                 first[c + 1] += 1
                 pairs += 1
@@ -68,7 +89,7 @@ def link_range(ring, faces, leaf, parent, size, most, mate, links):
     for h in range(half_edges):
         g = ring[h]
         while g != h:
-            if g > h and g // 3 != h // 3 and faces[h // 3, h % 3] != faces[g // 3, g % 3]:
+            if g > h and g // 3 != h // 3 and may_link(faces, h, g, flips):
                 at = first[pair_class[pair]]
                 first[pair_class[pair]] += 1
                 leave[at] = h
@@ -99,3 +120,4 @@ def link_range(ring, faces, leaf, parent, size, most, mate, links):
         far[other] = one
         length[one] = total
         length[other] = total
+    return refused

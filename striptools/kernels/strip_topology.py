@@ -1,7 +1,7 @@
 """From sequences of faces to generalised strips: the loops behind strips/topology.py.
 
 Sets of slots are bit masks (bit k for slot k). Slot k of a face is its edge from corner k to corner (k + 1)
-% 3.
+% 3. A face is *flipped* where it is read with its first two corners swapped.
 """
 
 import numpy as np
@@ -46,6 +46,16 @@ def crossings(faces, t, u):
     return ways
 
 
+@njit(cache=True, nogil=True)
+def may_flip(faces, t, u):
+    """Whether a strip may cross from face t to face u by an edge that both run the same way.
+
+    It may not where they run some other edge in opposite directions, which takes a repeated vertex: an
+    encoder would not know which of them are flipped.
+    """
+    return crossings(faces, t, u) == 0
+
+
 @njit(cache=True, nogil=True, forceinline=True)
 def slots_entered(ways):
     """The slots of the second face that a set of crossings enters by."""
@@ -87,17 +97,34 @@ def gather_strip(faces, order, begin, end, rows):
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def choose_strip(rows, count, ways, entries):
+def flip(rows, k):
+    """Swap the first two corners of a row."""
+    rows[k, 0], rows[k, 1] = rows[k, 1], rows[k, 0]
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def choose_strip(rows, count, flips_allowed, ways, entries, flipped):
     """Fill entries (count,) with the slot each row is entered by, 3 for the first; ways with all crossings.
 
-    Faces that share more than one edge leave a choice; the one of least slots from the strip's end backwards
-    is taken. Returns the first row that its predecessor cannot lead to, -1 where all can.
+    A row that runs no edge against the one before it, read as that is, is flipped in place where that helps
+    and is allowed; flipped (count,) says which were. Faces that share more than one edge leave a choice; the
+    one of least slots from the strip's end backwards is taken. Returns the first row that its predecessor
+    cannot lead to, -1 where all can.
     """
     # Go forward with the sets of slots each face can be entered by.
     reached = 0
     broken = -1
+    turned_over = False
+    flipped[0] = False
     for k in range(1, count):
+        if turned_over:
+            flip(rows, k)
         ways[k] = crossings(rows, k - 1, k)
+        if ways[k] == 0 and flips_allowed:
+            flip(rows, k)
+            ways[k] = crossings(rows, k - 1, k)
+            turned_over = not turned_over
+        flipped[k] = turned_over
         reached = slots_entered(ways[k] & USABLE[reached])
         entries[k] = reached
         if reached == 0 and broken < 0:
@@ -113,39 +140,44 @@ def choose_strip(rows, count, ways, entries):
 
 
 @njit(cache=True, nogil=True)
-def first_break(faces, order, starts):
+def first_break(faces, order, starts, flips_allowed):
     """The first position of any strip that its predecessor cannot lead to, -1 where all can."""
     longest = longest_strip(starts, 0, starts.shape[0] - 1)
     rows = np.empty((longest, 3), np.int32)
     ways = np.empty(longest, np.int64)
     entries = np.empty(longest, np.int64)
+    flipped = np.empty(longest, np.bool_)
     for strip in range(starts.shape[0] - 1):
         gather_strip(faces, order, starts[strip], starts[strip + 1], rows)
-        broken = choose_strip(rows, starts[strip + 1] - starts[strip], ways, entries)
+        count = starts[strip + 1] - starts[strip]
+        broken = choose_strip(rows, count, flips_allowed, ways, entries, flipped)
         if broken >= 0:
             return starts[strip] + broken
     return -1
 
 
 @njit(cache=True, nogil=True)
-def encode(faces, order, starts, first, last, vertices, turns, rotation):
-    """Fill vertices (n + 2s,), turns (n,) and rotation (n,) of the strips `first:last`.
+def encode(faces, order, starts, first, last, flips_allowed, vertices, turns, rotation, flips):
+    """Fill vertices (n + 2s,), turns (n,) and rotation (n,) of the strips `first:last`; set bits of flips.
 
-    Returns the first position that its predecessor cannot lead to, -1 where all can.
+    Returns the first position that its predecessor cannot lead to, -1 where all can, and whether any face is
+    flipped. Where none is, flips (n,), all False before, is not touched.
     """
     longest = longest_strip(starts, first, last)
     rows = np.empty((longest, 3), np.int32)
     ways = np.empty(longest, np.int64)
     entries = np.empty(longest, np.int64)
+    flipped = np.empty(longest, np.bool_)
+    any_flipped = False
     for strip in range(first, last):
         # Find the slots by which the faces are entered.
         begin = starts[strip]
         count = starts[strip + 1] - begin
         place = begin + 2 * strip
         gather_strip(faces, order, begin, begin + count, rows)
-        broken = choose_strip(rows, count, ways, entries)
+        broken = choose_strip(rows, count, flips_allowed, ways, entries, flipped)
         if broken >= 0:
-            return begin + broken
+            return begin + broken, any_flipped
 
         # Turn the first face so that the strip leaves it by the edge from corner 1 to corner 2.
         turn = 0
@@ -162,9 +194,15 @@ def encode(faces, order, starts, first, last, vertices, turns, rotation):
             # The face before is left by the slot one (no bit) or two (bit) places after its own first corner.
             leave = LEAST_SLOT[slots_left(ways[k], entry) & ~(1 << entries[k - 1])]
             turns[begin + k] = (leave + 3 - turn) % 3 == 2
-            rotation[begin + k] = entry
             turn = entry
-    return -1
+            # A flipped face is written with the corners swapped back, which turns it the other way round.
+            if flipped[k]:
+                rotation[begin + k] = (3 - entry) % 3
+                flips[begin + k] = True
+                any_flipped = True
+            else:
+                rotation[begin + k] = entry
+    return -1, any_flipped
 
 
 @njit(cache=True, nogil=True)
@@ -184,3 +222,11 @@ def decode(vertices, turns, starts, first, last, faces):
                 a, b = c, b
             c = vertices[place + 2 + k - begin]
             faces[k, 0], faces[k, 1], faces[k, 2] = a, b, c
+
+
+@njit(cache=True, nogil=True)
+def swap_flipped(flips, first, last, faces):
+    """Swap the first two corners of those of the faces `first:last` whose bit is set."""
+    for k in range(first, last):
+        if flips[k]:
+            flip(faces, k)

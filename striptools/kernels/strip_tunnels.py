@@ -15,6 +15,8 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
+from striptools.kernels.strip_topology import may_flip
+
 LONGEST = 256
 """Strips of more faces than this are left alone: an evaluation costs as much as its strips are long."""
 
@@ -24,9 +26,9 @@ MOST_ROTATIONS = 400
 TOP_WEIGHT = 4.0
 """What the hierarchy over the strips costs for a strip, in areas of the strip's box."""
 
-Ground = namedtuple("Ground", "ring faces boxes mirror room")
-"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`, and
-room (LONGEST, 6) float32 for evaluations."""
+Ground = namedtuple("Ground", "ring faces boxes mirror room flips")
+"""What a search does not change: ring (3n,), faces (n, 3), boxes (n, 6) float32, the table of `mirrors`,
+room (LONGEST, 6) float32 for evaluations, and flips, whether edges may be run the same way by both faces."""
 
 Strips = namedtuple("Strips", "rows begin length cost kept changed where mate")
 """The strips: rows (r,) int32, the arena; by strip begin and length (s,) int32 of its row, cost (s,) float64
@@ -278,7 +280,7 @@ def may_merge(strips, ground, w, freed, t, b, rest, most):
     """Whether w, an end of strip b of `rest` faces once its link by `freed` is cut, may find a partner."""
     for slot in range(3):
         h = 3 * w + slot
-        if strips.mate[h] >= 0 or h == freed:
+        if strips.mate[h] >= 0 and h != freed:
             continue
         g = ground.ring[h]
         while g != h:
@@ -290,7 +292,10 @@ def may_merge(strips, ground, w, freed, t, b, rest, most):
                 if (
                     (place == 0 or place == length - 1)
                     and (c == b or length + rest <= most)
-                    and ground.faces[v, g % 3] != ground.faces[w, slot]
+                    and (
+                        ground.faces[v, g % 3] != ground.faces[w, slot]
+                        or (ground.flips and may_flip(ground.faces, w, v))
+                    )
                 ):
                     return True
             g = ground.ring[g]
@@ -352,14 +357,18 @@ def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowa
             continue
         side = level[d, 3]
         u = g // 3
-        if side > 1 or mate[g] >= 0 or u == t or faces[u, g % 3] == faces[t, slot]:
+        if (
+            side > 1
+            or u == t
+            or (faces[u, g % 3] == faces[t, slot] and not (ground.flips and may_flip(faces, t, u)))
+        ):
             level[d, 2] = ring[g]
             level[d, 3] = 0
             continue
         b = where[u, 0]
         p = where[u, 1]
         length = lengths[b]
-        if p == 0 or p == length - 1:
+        if mate[g] < 0 and (p == 0 or p == length - 1):
             # Merge with the strip that ends here, and see what that is worth.
             level[d, 3] = 2
             if d == rotations and a != b and lengths[a] + length <= most:
@@ -383,13 +392,13 @@ def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowa
             continue
         # Cut u's link towards the head (side 0) or towards the end (side 1); see that the lengths are right.
         if a == b:
-            refused = side == 0 or p + 1 == length - 1
+            refused = side == 0 or p + 1 >= length - 1
             rest = length
         elif side == 0:
-            refused = lengths[a] + length - p > most
+            refused = p == 0 or lengths[a] + length - p > most
             rest = p
         else:
-            refused = lengths[a] + p + 1 > most
+            refused = p == length - 1 or lengths[a] + p + 1 > most
             rest = length - 1 - p
         if refused or done >= MOST_ROTATIONS:
             level[d, 3] += 1
@@ -398,6 +407,8 @@ def find_tunnel(strips, ground, search, start, rotations, neutral, price, allowa
         cut = 3 * u
         while mate[cut] < 0 or mate[cut] // 3 != w:
             cut += 1
+        # Go through a half-edge that is linked only where it is that link that is cut.
+        refused = mate[g] >= 0 and cut != g
         # Never cut a link that this chain has made, nor go where no merge can follow.
         for i in range(d):
             refused = refused or path[i, 0] == cut or path[i, 1] == cut

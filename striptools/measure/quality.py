@@ -35,8 +35,8 @@ class StripQuality:
         lengths: How many strips have from `k` to `2 k - 1` triangles, by k = 1, 2, 4, ...
         vertices_per_triangle: Entries of the strips over triangles: a strip of n triangles has n + 2.
         swaps: Equal turns in a row: each is a vertex to repeat where strips have to alternate.
-        classic_indices: Indices of the strips written as classic ones over triangles, everything counted:
-            swaps, restarts and whatever else `classic_strips` needs.
+        classic_indices: Indices of the strips written as classic ones, cut at flips, over triangles,
+            everything counted: swaps, restarts and whatever else `classic_strips` needs.
         classic_indices_without_restarts: The same less the restarts.
         strip_area: Half surface area of all strips' boxes, over that of the root's: how many strips a ray
             that meets the root's box is expected to enter.
@@ -191,9 +191,13 @@ def _spans(boxes: Boxes, begin: Counts, end: Counts) -> Boxes:
 
 def _classic(scene: Scene) -> tuple[int, int]:
     """Indices of the scene's strips written as classic ones, and how many of these are restarts."""
-    nothing = np.zeros(0)
     strips = Strips(
-        scene.vertices, scene.turns, scene.starts, nothing.astype(np.int32), nothing.astype(np.uint8)
+        scene.vertices,
+        scene.turns,
+        scene.starts,
+        np.arange(scene.triangle_count, dtype=np.int32),
+        np.zeros(scene.triangle_count, np.uint8),
+        scene.flips,
     )
     indices = classic_strips(strips)
     return len(indices), int((indices == RESTART).sum())

@@ -85,6 +85,8 @@ def _check_dtypes(scene: Scene) -> None:
         ("hierarchy.boxes", scene.hierarchy.boxes, np.float32),
         ("hierarchy.left_count", scene.hierarchy.left_count, np.uint32),
     ]
+    if scene.flips is not None:
+        wanted.append(("flips", scene.flips, np.bool_))
     if scene.remap is not None:
         wanted += [
             ("remap.face", scene.remap.face, np.int32),
@@ -105,6 +107,8 @@ def _check_counts(scene: Scene, where: str) -> None:
         raise unreadable("RDM202", f"{where}: SCEN")
     if len(scene.vertices) != corners or scene.positions.shape != (vertices, 3):
         raise unreadable("RDM114", f"{where}: SVTX")
+    if scene.flips is not None and len(scene.flips) != triangles:
+        raise unreadable("RDM114", f"{where}: FLIP")
 
 
 def _check_strips(scene: Scene, where: str) -> None:
@@ -115,6 +119,12 @@ def _check_strips(scene: Scene, where: str) -> None:
     turned = np.flatnonzero(scene.turns[starts[:-1]])
     if len(turned):
         raise unreadable("RDM303", f"{where}: TURN: strip {turned[0]}")
+    if scene.flips is not None:
+        flipped = np.flatnonzero(scene.flips[starts[:-1]])
+        if len(flipped):
+            raise unreadable("RDM310", f"{where}: FLIP: strip {flipped[0]}")
+        if not scene.flips.any():
+            raise unreadable("RDM311", f"{where}: FLIP")
 
 
 def _check_vertices(scene: Scene, where: str) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-VERSION = (0, 1)
+VERSION = (0, 2)
 ALIGNMENT = 64
 SECTION_LIMIT = 64
 TRIANGLE_LIMIT = 2**29
@@ -94,13 +94,14 @@ SCENE = Section(b"SCEN", "headers", True)
 POSITIONS = Section(b"POSN", "positions", True)
 STRIP_VERTICES = Section(b"SVTX", "strip_vertices", True)
 TURNS = Section(b"TURN", "turns", True)
+FLIPS = Section(b"FLIP", "flips", True)
 STRIP_STARTS = Section(b"STRT", "strip_starts", True)
 HIERARCHY = Section(b"HIER", "hierarchy", True)
 REMAP = Section(b"RMAP", "remap", False)
-SECTIONS = (SCENE, POSITIONS, STRIP_VERTICES, TURNS, STRIP_STARTS, HIERARCHY, REMAP)
+SECTIONS = (SCENE, POSITIONS, STRIP_VERTICES, TURNS, FLIPS, STRIP_STARTS, HIERARCHY, REMAP)
 """In the order in which the writer puts them."""
 
-PARTS = ("positions", "strip_vertices", "turns", "strip_starts", "hierarchy", "remap", "headers")
+PARTS = ("positions", "strip_vertices", "turns", "flips", "strip_starts", "hierarchy", "remap", "headers")
 
 
 def aligned(length: int) -> int:
@@ -108,13 +109,16 @@ def aligned(length: int) -> int:
     return -(-length // ALIGNMENT) * ALIGNMENT
 
 
-def section_lengths(triangles: int, vertices: int, strips: int, *, remap: bool) -> dict[bytes, int]:
+def section_lengths(
+    triangles: int, vertices: int, strips: int, *, flips: bool, remap: bool
+) -> dict[bytes, int]:
     """Say how long each section of a scene is; a section of no bytes is left out of the file."""
     return {
         SCENE.kind: SCENE_RECORD.size,
         POSITIONS.kind: 12 * vertices,
         STRIP_VERTICES.kind: 4 * (triangles + 2 * strips),
         TURNS.kind: (triangles + 7) // 8,
+        FLIPS.kind: (triangles + 7) // 8 if flips else 0,
         STRIP_STARTS.kind: 4 * (strips + 1),
         HIERARCHY.kind: 28 * (strips - 1),
         REMAP.kind: 4 * triangles if remap else 0,

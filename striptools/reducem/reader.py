@@ -165,8 +165,8 @@ def _scene(sections: dict[bytes, memoryview], where: str) -> Scene:
     corners = triangles + 2 * strips
     if not (1 <= strips <= triangles <= layout.TRIANGLE_LIMIT and 3 <= vertices <= corners):
         raise unreadable("RDM201", f"{where}: SCEN")
-    has_remap = layout.REMAP.kind in sections
-    lengths = layout.section_lengths(triangles, vertices, strips, remap=has_remap)
+    has_flips, has_remap = layout.FLIPS.kind in sections, layout.REMAP.kind in sections
+    lengths = layout.section_lengths(triangles, vertices, strips, flips=has_flips, remap=has_remap)
     for kind, length in lengths.items():
         _check_length(kind, length, len(sections.get(kind, b"")), where)
     boxes_end = 24 * (strips - 1)
@@ -174,7 +174,10 @@ def _scene(sections: dict[bytes, memoryview], where: str) -> Scene:
     return Scene(
         positions=_array(sections[layout.POSITIONS.kind], "<f4", np.float32).reshape(-1, 3),
         vertices=_array(sections[layout.STRIP_VERTICES.kind], "<i4", np.int32),
-        turns=_turns(sections[layout.TURNS.kind], triangles, where),
+        turns=_bits(sections[layout.TURNS.kind], triangles, "RDM304", f"{where}: TURN"),
+        flips=_bits(sections[layout.FLIPS.kind], triangles, "RDM309", f"{where}: FLIP")
+        if has_flips
+        else None,
         starts=_array(sections[layout.STRIP_STARTS.kind], "<i4", np.int32),
         hierarchy=StripHierarchy(
             _array(hierarchy[:boxes_end], "<f4", np.float32).reshape(-1, 6),
@@ -201,10 +204,10 @@ def _array(payload: memoryview, stored: str, native: type) -> np.ndarray:
     return np.frombuffer(payload, stored).astype(native, copy=False)
 
 
-def _turns(payload: memoryview, triangles: int, where: str) -> np.ndarray:
+def _bits(payload: memoryview, triangles: int, code: str, where: str) -> np.ndarray:
     bits = np.unpackbits(np.frombuffer(payload, np.uint8), bitorder="little").view(np.bool_)
     if bits[triangles:].any():
-        raise unreadable("RDM304", f"{where}: TURN")
+        raise unreadable(code, where)
     return bits[:triangles]
 
 

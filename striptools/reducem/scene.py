@@ -44,6 +44,7 @@ class Scene:
         positions: (v, 3) float32 in the model's unit, bit for bit those of the cleaned source.
         vertices: (n+2s,) int32 vertex of each strip vertex.
         turns: (n,) bool, the turn of each triangle; False for the first of a strip.
+        flips: (n,) bool, whether each triangle runs against its strip; None where none does.
         starts: (s+1,) int32, the first triangle of each strip, then n.
         hierarchy: Over the strips.
         remap: The source's faces, or None where it was left out.
@@ -54,6 +55,7 @@ class Scene:
     positions: Positions
     vertices: Counts
     turns: Bools
+    flips: Bools | None
     starts: Counts
     hierarchy: StripHierarchy
     remap: Remap | None
@@ -83,7 +85,7 @@ class Scene:
         """
         decoded = self.__dict__.get("_faces")
         if decoded is None:
-            decoded = decode_strips(self.vertices, self.turns, self.starts)
+            decoded = decode_strips(self.vertices, self.turns, self.starts, self.flips)
             self.__dict__["_faces"] = decoded
         return decoded
 
@@ -123,7 +125,7 @@ class Scene:
         """Count the bytes of the scene file by part.
 
         Returns:
-            Bytes of `positions`, `strip_vertices`, `turns`, `strip_starts`, `hierarchy`, `remap` and
+            Bytes of `positions`, `strip_vertices`, `turns`, `flips`, `strip_starts`, `hierarchy`, `remap` and
             `headers` (file header, section table, scene record and padding); their sum is the file's length.
         """
         from striptools.reducem.writer import section_sizes
@@ -175,6 +177,7 @@ def scene_from_strips(
         positions=ordered,
         vertices=vertices,
         turns=strips.turns,
+        flips=strips.flips,
         starts=strips.starts,
         hierarchy=hierarchy,
         remap=remap,

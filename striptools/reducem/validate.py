@@ -19,7 +19,8 @@ from striptools.strips.topology import decode_strips
 __all__ = ["validate"]
 
 _NEEDED = {b"SCEN", b"POSN", b"SVTX", b"TURN", b"STRT", b"HIER"}
-_KNOWN = _NEEDED | {b"RMAP"}
+_UNDERSTOOD = _NEEDED | {b"FLIP"}
+_KNOWN = _UNDERSTOOD | {b"RMAP"}
 
 
 @dataclass
@@ -77,7 +78,7 @@ def _header(parsed: _Parsed) -> None:
     if len(data) < 32:
         return parsed.found("RDM101")
     major, minor, count, total, reserved, checksum = struct.unpack_from("<HHIQII", data, 8)
-    if (major, minor) != (0, 1):
+    if (major, minor) != (0, 2):
         return parsed.found("RDM103", f"version {major}.{minor}")
     if total != len(data):
         parsed.found("RDM104")
@@ -123,7 +124,7 @@ def _entry(parsed: _Parsed, kind: bytes, flags: int, reserved: int, place: str) 
         parsed.found("RDM107", place)
     elif kind not in _KNOWN:
         parsed.found("RDM111" if flags else "RDM115", place)
-    elif flags != (kind in _NEEDED):
+    elif flags != (kind in _UNDERSTOOD):
         parsed.found("RDM116", place)
 
 
@@ -156,6 +157,8 @@ def _lengths(parsed: _Parsed, triangles: int, vertices: int, strips: int) -> Non
         b"STRT": strips * 4 + 4,
         b"HIER": (strips - 1) * 28,
     }
+    if b"FLIP" in parsed.sections:
+        wanted[b"FLIP"] = wanted[b"TURN"]
     if b"RMAP" in parsed.sections:
         wanted[b"RMAP"] = triangles * 4
     for kind, length in wanted.items():
@@ -178,14 +181,28 @@ def _contents(parsed: _Parsed, triangles: int, vertices: int, strips: int) -> No
         parsed.found("RDM302", "STRT")
     elif bits[starts[:-1]].any():
         parsed.found("RDM303", "TURN")
+    flips = _flips(parsed, triangles, starts)
     if (index >= vertices).any():
         parsed.found("RDM305", "SVTX")
     else:
         _first_uses(parsed, index, vertices)
     if not parsed.has_errors:
         turns = bits[:triangles].astype(np.bool_)
-        _repeats(parsed, decode_strips(index.astype(np.int32), turns, starts.astype(np.int32)))
+        _repeats(parsed, decode_strips(index.astype(np.int32), turns, starts.astype(np.int32), flips))
         _hierarchy(parsed, positions[index], starts + 2 * np.arange(strips + 1), strips)
+
+
+def _flips(parsed: _Parsed, triangles: int, starts: np.ndarray) -> np.ndarray | None:
+    if b"FLIP" not in parsed.sections:
+        return None
+    bits = np.unpackbits(np.frombuffer(parsed.sections[b"FLIP"], np.uint8), bitorder="little")
+    if bits[triangles:].any():
+        parsed.found("RDM309", "FLIP")
+    if bits[starts[starts < triangles]].any():
+        parsed.found("RDM310", "FLIP")
+    if not bits[:triangles].any():
+        parsed.found("RDM311", "FLIP")
+    return bits[:triangles].astype(np.bool_)
 
 
 def _first_uses(parsed: _Parsed, index: np.ndarray, vertices: int) -> None:

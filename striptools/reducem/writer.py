@@ -26,6 +26,7 @@ class SectionSizes:
     positions: int
     strip_vertices: int
     turns: int
+    flips: int
     strip_starts: int
     hierarchy: int
     remap: int
@@ -84,7 +85,11 @@ def section_sizes(scene: Scene) -> SectionSizes:
 
 def _lengths(scene: Scene) -> dict[bytes, int]:
     lengths = layout.section_lengths(
-        scene.triangle_count, scene.vertex_count, scene.strip_count, remap=scene.remap is not None
+        scene.triangle_count,
+        scene.vertex_count,
+        scene.strip_count,
+        flips=scene.flips is not None,
+        remap=scene.remap is not None,
     )
     return {kind: length for kind, length in lengths.items() if length}
 
@@ -108,6 +113,9 @@ def _payloads(scene: Scene) -> dict[bytes, bytes | memoryview]:
         layout.POSITIONS.kind: _view(scene.positions, "<f4"),
         layout.STRIP_VERTICES.kind: _view(scene.vertices, "<i4"),
         layout.TURNS.kind: np.packbits(scene.turns, bitorder="little").tobytes(),
+        layout.FLIPS.kind: b""
+        if scene.flips is None
+        else np.packbits(scene.flips, bitorder="little").tobytes(),
         layout.STRIP_STARTS.kind: _view(scene.starts, "<i4"),
         layout.HIERARCHY.kind: scene.hierarchy.boxes.astype("<f4", copy=False).tobytes()
         + scene.hierarchy.left_count.astype("<u4", copy=False).tobytes(),

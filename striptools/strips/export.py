@@ -87,6 +87,6 @@ def export_strips(mesh: Mesh, file_format: str, effort: Effort = "normal", threa
     adjacency = build_adjacency(mesh.faces, mesh.vertex_count)
     options = AlternatingOptions(effort, _STITCH_PRICE if stitched else _RESTART_PRICE)
     sequences = alternating_strips(adjacency, mesh.faces, options, threads)
-    strips = encode_strips(mesh.faces, sequences)
+    strips = encode_strips(mesh.faces, sequences, flips=False)
     count = count_classic(strips, None if stitched else RESTART)
     return StripExport(Mesh(mesh.positions, mesh.faces[sequences.faces]), strips, count, file_format)

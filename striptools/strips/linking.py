@@ -4,12 +4,16 @@ Source: the step "Ordering" of Lauterbach, Yoon, Tang, Manocha, "ReduceM: Intera
 Tracing of Large Models" (EGSR 2008), whose aim (compact strips) and means (the SAH object tree) are kept.
 
 Differences from strips/ordering.py, which has the paper's rounds:
-1. Every pair of half-edges that run one edge in opposite directions is ranked once, by the size of the
-   smallest subtree that holds both faces, in classes of half an octave. The pairs of the least class are
-   linked first; within a class in the order of their half-edges (faces stand in the tree's order).
+1. Every pair of half-edges that run one edge in opposite directions (in any, where flips are allowed) is
+   ranked once, by the size of the smallest subtree that holds both faces, in classes of half an octave. The
+   pairs of the least class are linked first; within a class in the order of their half-edges (faces stand in
+   the tree's order).
 2. A pair is linked where both faces have a free end there, they are of different paths, and the cap holds.
    What is linked stays linked: nothing is ranked again, and there is no balance term.
-3. Classes, not exact sizes: within half an octave the difference is noise, and a counting sort does.
+3. In a class, edges of two faces come before edges of more: what two faces leave free on an edge of four is
+   a way for the other two, and two faces that share all their edges are best linked by one that nobody else
+   needs.
+4. Classes, not exact sizes: within half an octave the difference is noise, and a counting sort does.
 
 Cost: O(E) and a climb to the common node a pair, which is short because neighbours in space are neighbours
 in the tree; 40 bytes a face of working memory.
@@ -41,7 +45,8 @@ def link_faces(
         adjacency: Rings of half-edges of `faces`.
         faces: (n, 3) int32.
         tree: Object tree with one face an item.
-        options: Only the cap is looked at; the defaults of OrderingOptions when left out.
+        options: Only the cap is looked at, for no flips are made; the defaults of OrderingOptions when left
+            out.
 
     Returns:
         Sequences of at most max_length faces, each from its end that comes first in the tree, in the order of
@@ -59,7 +64,7 @@ def link_faces(
     renumber(faces, adjacency.ring, tree.order, place, placed, ring)
     mate, links = np.zeros(3 * count, np.int32), np.zeros(count, np.uint8)
     most = (options or OrderingOptions()).max_length
-    link_range(ring, placed, tree.leaf_node[tree.order], tree.parent, tree.size, most, mate, links)
+    link_range(ring, placed, tree.leaf_node[tree.order], tree.parent, tree.size, most, False, mate, links)
     order, starts = np.zeros(count, np.int32), np.zeros(count + 1, np.int32)
     strips = walk_links(mate, links, order, starts)
     return Sequences(tree.order[order], starts[: strips + 1].copy())

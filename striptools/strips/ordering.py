@@ -67,6 +67,8 @@ class OrderingOptions:
         balance_weight: Weight of equal lengths, 0 or more; looked at by `paper`.
         block: Cut the mesh into blocks of at most so many triangles and as many vertices first, 4 to
             65536, and order inside them; looked at by `strip-rt`. None for no blocks.
+        flips: Let strips cross edges that both faces run the same way, where that makes the scene smaller;
+            looked at by `strip-rt`.
     """
 
     max_length: int = 128
@@ -75,6 +77,7 @@ class OrderingOptions:
     distance_weight: float = 0.5
     balance_weight: float = 0.5
     block: int | None = None
+    flips: bool = True
 
     def __post_init__(self) -> None:
         for name, value, allowed in (("method", self.method, METHODS), ("effort", self.effort, EFFORT_NAMES)):
@@ -100,7 +103,8 @@ class OrderingOptions:
 class Sequences:
     """Faces in strip order.
 
-    Each face stands once; neighbours in a sequence share an edge that they run in opposite directions.
+    Each face stands once; neighbours in a sequence share an edge. They run it in opposite directions unless
+    the sequence was made with flips.
 
     Attributes:
         faces: (n,) int32, the faces of all sequences one after another.

@@ -18,6 +18,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,13 +28,16 @@ from striptools.mesh.adjacency import build_adjacency
 from striptools.partition.cut import CHUNK, Cut, cut_tree, grouped
 from striptools.strips.ordering import OrderingOptions, Sequences, order_strips
 from striptools.strips.tunnelling import EFFORTS, NO_TUNNELS, Effort
-from striptools.types import Boxes, Counts, Faces
+from striptools.types import Bools, Boxes, Counts, FaceIds, Faces
 
 if TYPE_CHECKING:
     from striptools.partition.object_split import ObjectTree
 
 Progress = Callable[[float], None]
 """Called with the fraction done, above 0 and below 1."""
+
+TRIANGLES_A_STRIP = 320
+"""How many flip bits cost as much as a strip: 40 bytes, two vertices, a start and a node of the hierarchy."""
 
 
 def stripify(
@@ -68,7 +72,8 @@ def stripify(
     if options.method == "strip-rt":
         cut = cut_for(tree, faces, vertex_count, options)
         effort = EFFORTS[options.effort]
-        return order_cut(faces, vertex_count, boxes, tree, cut, options.max_length, effort, threads, watch)
+        order = partial(order_cut, faces, vertex_count, boxes, tree, cut, options.max_length, effort)
+        return order(threads, watch, flips=options.flips)
     if options.method == "tipsify":
         from striptools.strips.tipsify import tipsify
 
@@ -98,8 +103,14 @@ def order_cut(
     effort: Effort | None = NO_TUNNELS,
     threads: int = 1,
     watch: Progress | None = None,
+    *,
+    flips: bool = True,
 ) -> Sequences:
     """Order the faces inside each range of a cut: link, then tunnel with an effort, or only link for None.
+
+    All ranges are ordered without flips first. Where enough half-edges are left without a partner of their
+    winding, the ranges that have some are ordered again with flips, and that is kept where it saves more than
+    flip bits cost.
 
     Args:
         faces: (n, 3) int32.
@@ -110,32 +121,48 @@ def order_cut(
         max_length: The most faces of a strip.
         effort: How tunnels are searched, or None for none.
         threads: How many threads share the ranges.
-        watch: Told how far the work is.
+        watch: Told how far the work is, flips left out.
+        flips: Whether strips may cross edges that both faces run the same way.
     """
     from striptools.kernels.strip_chunks import order_ranges
 
     count = len(faces)
-    placed, is_first = np.zeros(count, np.int32), np.zeros(count, np.bool_)
     given = (faces, boxes, tree.order, tree.leaf_node, tree.parent, tree.size, cut.starts)
     numbers = effort.numbers if effort else (-1, 0, 0.0, 0.0, 0)
     own = threading.local()
 
-    def order_job(job: tuple[int, int]) -> None:
+    def order_job(job: tuple[int, int], placed: FaceIds, is_first: Bools, *, flip: bool) -> int:
         if not hasattr(own, "number"):
             own.number = np.full(vertex_count, -1, np.int32)
-        order_ranges(*given, *job, max_length, numbers, own.number, placed, is_first)
+        return order_ranges(*given, *job, max_length, numbers, flip, own.number, placed, is_first)[2]
 
-    jobs = _jobs(cut)
-    for done, _ in enumerate(_in_order(order_job, jobs, threads)):
+    plain = np.zeros(count, np.int32), np.zeros(count, np.bool_)
+    jobs, stranded = _jobs(cut), []
+    for done, half_edges in enumerate(
+        _in_order(lambda job: order_job(job, *plain, flip=False), jobs, threads)
+    ):
+        stranded.append(half_edges)
         if watch and done:
             watch(done / len(jobs))
+    placed, is_first = plain
+    if flips and _pays(sum(stranded) // 2, count):
+        flipped = placed.copy(), is_first.copy()
+        again = [job for job, half_edges in zip(jobs, stranded, strict=True) if half_edges]
+        list(_in_order(lambda job: order_job(job, *flipped, flip=True), again, threads))
+        if _pays(int(is_first.sum()) - int(flipped[1].sum()), count):
+            placed, is_first = flipped
     return Sequences(placed, np.append(np.flatnonzero(is_first), count).astype(np.int32))
 
 
+def _pays(strips: int, triangles: int) -> bool:
+    """Whether so many strips fewer are worth a flip bit a triangle."""
+    return strips * TRIANGLES_A_STRIP > triangles
+
+
 def _in_order(
-    work: Callable[[tuple[int, int]], None], jobs: list[tuple[int, int]], threads: int
-) -> Iterator[None]:
-    """Do the jobs, in this thread where one is all, and yield as each is done, in their order."""
+    work: Callable[[tuple[int, int]], int], jobs: list[tuple[int, int]], threads: int
+) -> Iterator[int]:
+    """Do the jobs, in this thread where one is all, and yield what each gives, in their order."""
     if threads <= 1:
         yield from map(work, jobs)
         return
@@ -171,4 +198,19 @@ def _jobs(cut: Cut) -> list[tuple[int, int]]:
 # price 1.0 gives 1.052/1.135, 1.15 1.049/1.143, 1.3 1.047/1.149. Splits aligned with blocks of 256, dragon,
 # by the most blocks of an aligned range: none fills 68 % of a block, duplicates 1.245 vertices a vertex and
 # costs 1.081; 4: 85 %, 1.224, 1.086; 8: 91 %, 1.220, 1.089; 12: 94 %, 1.2196, 1.093.
-# Strips do not cross edges that both faces run the same way, so tree_japanesemaple stays at 1.213.
+#
+# Edges of more than two faces: tree_japanesemaple has 23,500 edges of four faces and 7,500 of three. Each on
+# top of the one before, effort normal, without flips / with them, vertices per triangle / expected cost:
+#
+#   flips alone                                 1.213/1.048   1.197/1.067
+#   an end may leave by the edge of its cut                   1.193/1.067
+#   edges of two faces first in linking                       1.128/1.073
+#   a link of a ring may be cut for another     1.129/1.056   1.103/1.079
+#   effort best                                 1.127/1.051   1.101/1.071
+#
+# So most of what looked like winding was pairs of equal faces linked by the one edge that others needed. A
+# higher price would not have helped (9 and 6 passes in the first row: 1.191). 5,256 components bound it at
+# 1.053. Flips save 0.4 of 13.6 bytes a triangle there, and double the time of ordering; icub, chandelier and
+# ugly_bunny_holes have too few edges of one winding to pay for the bits and stay without. The rest of the
+# table took them from 1.0444 to 1.0439, 1.0580 to 1.0525 and 1.0516 to 1.0514. Meshes of two faces an edge
+# have the strips that they had.

@@ -1,4 +1,4 @@
-"""Topology of strips: generalised ones with one turn bit a triangle, classic alternating ones for export.
+"""Topology of strips: generalised ones with turn and flip bits, classic alternating ones for export.
 
 **Generalised strips** (what the scene stores). A strip of k triangles is a row of k + 2 vertices and k turn
 bits. Its first triangle is (a, b, c) = vertices 0, 1, 2. Each further triangle j adds vertex j + 2, w,
@@ -7,10 +7,16 @@ behind the edge by which the strip leaves the triangle (a, b, c) before it:
     turn bit 0: by b -> c, the next triangle is (c, b, w)
     turn bit 1: by c -> a, the next triangle is (a, c, w)
 
-Both run the shared edge against the triangle before, so that every triangle has the winding of its source
-face. The edge a -> b, by which a triangle was entered, is never left by. The turn bit of a strip's FIRST
-triangle is unused and is 0. An encoder turns the first triangle so that the bit of the SECOND is 0; a
+Both run the shared edge against the triangle before, so that a strip of faces of one winding has the winding
+of its source. The edge a -> b, by which a triangle was entered, is never left by. The turn bit of a strip's
+FIRST triangle is unused and is 0. An encoder turns the first triangle so that the bit of the SECOND is 0; a
 decoder takes either.
+
+A face that runs the shared edge the same way as the one before is walked over with its first two corners
+swapped, and its *flip bit* is set: the walk goes on as above, and where the bit is set the triangle (a, b, c)
+stands for the face (b, a, c). The bit tells of the triangle alone, against the walk and not against its
+neighbour, so that one triangle can still be read alone. The walk has the winding of the strip's first face,
+whose bit is 0. Strips without any flip have no bits at all.
 
 So in triangle j of a strip c is vertex j + 2, and, looking back from j over the bits 1..j, a is the vertex p
 + 1 of the last triangle p with bit 0, b the vertex q + 1 of the last triangle q with bit 1; where there is
@@ -22,12 +28,13 @@ Source: Lauterbach et al., ReduceM (EGSR 2008), step "Strip output", which print
 1. A turn bit stands for a swap vertex: n + 2 vertices for n triangles, whatever the turns.
 2. The rotation of each triangle against its source face is kept, so that source corners can be restored.
 3. Where two faces share more than one edge, any crossing that leaves no face by its entry edge is found.
+4. A strip may cross an edge that both faces run the same way, for a flip bit.
 
-**Classic strips** (classic_strips): triangle k of a strip is indices k, k + 1, k + 2, with the first two
-swapped for odd k. Equal turns in a row cost one repeated vertex each. Strips are set apart by a restart index
-or by two repeated vertices; where a strip begins with the vertex that ended the one before, it follows at
-once, which saves the restart. Which strip follows, and from which end each is written, is free and chosen
-greedily.
+**Classic strips** (classic_strips) have no flips: strips are cut where the winding changes. Triangle k of a
+strip is indices k, k + 1, k + 2, with the first two swapped for odd k. Equal turns in a row cost one repeated
+vertex each. Strips are set apart by a restart index or by two repeated vertices; where a strip begins with
+the vertex that ended the one before, it follows at once, which saves the restart. Which strip follows, and
+from which end each is written, is free and chosen greedily.
 
 Cost: O(n), all of it.
 """
@@ -60,6 +67,8 @@ class Strips:
         source_face: (n,) int32, the face each triangle was.
         rotation: (n,) uint8, places its corners were turned to the left: decoded[j] = source[(j + rotation)
         % 3].
+        flips: (n,) bool, the flip bit of each triangle, False for the first of each strip; None where no
+            triangle has one.
     """
 
     vertices: Counts
@@ -67,15 +76,17 @@ class Strips:
     starts: Counts
     source_face: FaceIds
     rotation: Rotations
+    flips: Bools | None = None
 
 
-def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strips:
+def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1, *, flips: bool = True) -> Strips:
     """Write sequences of faces as generalised strips.
 
     Args:
         faces: (n, 3) int32.
-        sequences: Each face once, neighbours share an edge run in opposite directions.
+        sequences: Each face once, neighbours share an edge.
         threads: How many threads share the strips; the result is the same for any number.
+        flips: Whether neighbours may run their edge the same way.
 
     Returns:
         Strips whose decoded triangles are the faces of `sequences.faces`, turned left by `rotation`.
@@ -87,23 +98,28 @@ def encode_strips(faces: Faces, sequences: Sequences, threads: int = 1) -> Strip
     vertices = np.zeros(len(order) + 2 * (len(starts) - 1), np.int32)
     turns = np.zeros(len(order), np.bool_)
     rotation = np.zeros(len(order), np.uint8)
-    broken = in_chunks(
-        lambda part: kernels.encode(faces, order, starts, *part, vertices, turns, rotation),
+    flipped = np.zeros(len(order), np.bool_)
+    parts = in_chunks(
+        lambda part: kernels.encode(faces, order, starts, *part, flips, vertices, turns, rotation, flipped),
         len(starts) - 1,
         threads,
         _strips_a_chunk(starts),
     )
-    _refuse_break(next((place for place in broken if place >= 0), -1), "encode_strips")
-    return Strips(vertices, turns, starts, order, rotation)
+    _refuse_break(next((place for place, _ in parts if place >= 0), -1), "encode_strips")
+    has_flips = any(part_has for _, part_has in parts)
+    return Strips(vertices, turns, starts, order, rotation, flipped if has_flips else None)
 
 
-def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int = 1) -> Faces:
+def decode_strips(
+    vertices: Counts, turns: Bools, starts: Counts, flips: Bools | None = None, *, threads: int = 1
+) -> Faces:
     """The triangles of generalised strips, (n, 3) int32, in file order and with the winding of their sources.
 
     Args:
         vertices: (n + 2 s,) int32.
         turns: (n,) bool; those of first triangles are not looked at.
         starts: (s+1,) int32, from 0 to n, rising.
+        flips: (n,) bool; None where no triangle has a flip.
         threads: How many threads share the strips.
 
     Raises:
@@ -113,6 +129,8 @@ def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int =
     _check_starts(starts, count, "starts")
     if len(vertices) != count + 2 * strip_count:
         raise UsageError(f"{len(vertices)} vertices for {count} triangles", where="decode_strips")
+    if flips is not None and len(flips) != count:
+        raise UsageError(f"{len(flips)} flip bits for {count} triangles", where="decode_strips")
     faces = np.zeros((count, 3), np.int32)
     in_chunks(
         lambda part: kernels.decode(vertices, turns, starts, *part, faces),
@@ -120,17 +138,22 @@ def decode_strips(vertices: Counts, turns: Bools, starts: Counts, threads: int =
         threads,
         _strips_a_chunk(starts),
     )
+    if flips is not None:
+        in_chunks(lambda part: kernels.swap_flipped(flips, *part, faces), count, threads)
     return faces
 
 
-def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: int) -> tuple[int, int, int]:
-    """One triangle alone, read from its strip's own vertices and turn bits.
+def decode_triangle(
+    vertices: Counts, turns: Bools, starts: Counts, triangle: int, flips: Bools | None = None
+) -> tuple[int, int, int]:
+    """One triangle alone, read from its strip's own vertices and turn bits and its flip bit.
 
     Args:
         vertices: (n + 2 s,) int32.
         turns: (n,) bool.
         starts: (s+1,) int32.
         triangle: Its place in file order.
+        flips: (n,) bool, or None.
     """
     strip = int(np.searchsorted(starts, triangle, side="right")) - 1
     begin = int(starts[strip])
@@ -140,8 +163,22 @@ def decode_triangle(vertices: Counts, turns: Bools, starts: Counts, triangle: in
     for corner, bit in ((0, False), (1, True)):
         back = np.flatnonzero(bits == bit)[:1]
         places.append(first + (triangle - begin - int(back[0]) + 1 if len(back) else corner))
+    if flips is not None and flips[triangle]:
+        places.reverse()
     last = first + triangle - begin + 2
     return int(vertices[places[0]]), int(vertices[places[1]]), int(vertices[last])
+
+
+def without_flips(strips: Strips) -> Strips:
+    """The same triangles in the same order, each strip cut where its flip bit changes, and no flips."""
+    if strips.flips is None:
+        return strips
+    faces = decode_strips(strips.vertices, strips.turns, strips.starts, strips.flips)
+    changes = np.flatnonzero(strips.flips[1:] != strips.flips[:-1]) + 1
+    starts = np.union1d(strips.starts, changes).astype(np.int32)
+    cut = encode_strips(faces, Sequences(np.arange(len(faces), dtype=np.int32), starts), flips=False)
+    rotation = (strips.rotation + cut.rotation) % 3
+    return Strips(cut.vertices, cut.turns, cut.starts, strips.source_face, rotation.astype(np.uint8))
 
 
 @dataclass(frozen=True)
@@ -164,11 +201,11 @@ class ClassicCount:
 def classic_strips(strips: Strips, restart: int | None = RESTART) -> Counts:
     """Classic alternating strips as one index list.
 
-    Every triangle keeps its winding. Each strip is written from the end whose first turn fits its place, and
-    strips are put in an order in which many begin with the vertex that ended the one before: these follow at
-    once, and their common vertex stands twice. Other strips are set apart by `restart`, or by the last vertex
-    and the next one once more. Repeated vertices make triangles of no area that decode_classic and every
-    renderer drop.
+    Every triangle keeps its winding: strips are cut where their flip bit changes. Each strip is written from
+    the end whose first turn fits its place, and strips are put in an order in which many begin with the
+    vertex that ended the one before: these follow at once, and their common vertex stands twice. Other strips
+    are set apart by `restart`, or by the last vertex and the next one once more. Repeated vertices make
+    triangles of no area that decode_classic and every renderer drop.
 
     Args:
         strips: Generalised strips of faces with three different vertices.
@@ -180,6 +217,7 @@ def classic_strips(strips: Strips, restart: int | None = RESTART) -> Counts:
     Raises:
         UsageError: A vertex has the restart index, or a triangle a repeated vertex.
     """
+    strips = without_flips(strips)
     faces = _distinct_corners(strips)
     if restart is not None and (strips.vertices == restart).any():
         raise UsageError(f"vertex {restart} is the restart index", where="restart")
@@ -202,6 +240,7 @@ def count_classic(strips: Strips, restart: int | None = RESTART) -> ClassicCount
     Raises:
         UsageError: A triangle has a repeated vertex.
     """
+    strips = without_flips(strips)
     _, length, joins = _plan_classic(strips, _distinct_corners(strips), stitched=restart is None)
     apart = max(len(strips.starts) - 2, 0) - joins
     between = apart if restart is not None else 2 * apart
@@ -241,8 +280,16 @@ def decode_classic(indices: Counts, restart: int = RESTART) -> Faces:
     return rows[~_repeats(rows)]
 
 
-def check_sequences(sequences: Sequences, faces: Faces, max_length: int | None = None) -> None:
+def check_sequences(
+    sequences: Sequences, faces: Faces, max_length: int | None = None, *, flips: bool = True
+) -> None:
     """Raise unless each face stands once, and each can be reached from the one before it in its sequence.
+
+    Args:
+        sequences: In question.
+        faces: (n, 3) int32.
+        max_length: The most faces that a sequence may have.
+        flips: Whether neighbours may run their edge the same way.
 
     Raises:
         UsageError: Naming what is broken and where.
@@ -252,7 +299,7 @@ def check_sequences(sequences: Sequences, faces: Faces, max_length: int | None =
     _check_starts(starts, len(order), "sequences")
     longest = int(sequences.lengths.max(initial=0))
     _expect(max_length is None or longest <= max_length, "sequences", f"one has {longest} faces")
-    _refuse_break(kernels.first_break(faces, order, starts), "sequences")
+    _refuse_break(kernels.first_break(faces, order, starts, flips), "sequences")
 
 
 def check_strips(strips: Strips, faces: Faces) -> None:
@@ -265,13 +312,18 @@ def check_strips(strips: Strips, faces: Faces) -> None:
     _check_starts(strips.starts, count, "strips")
     _expect(len(strips.vertices) == count + 2 * strip_count, "strips", f"{len(strips.vertices)} vertices")
     _expect(not strips.turns[strips.starts[:-1]].any(), "strips", "an unused turn bit is set")
+    if strips.flips is not None:
+        _expect(len(strips.flips) == count, "strips", f"{len(strips.flips)} flip bits")
+        _expect(bool(strips.flips.any()), "strips", "there are flip bits, but no flip")
+        _expect(not strips.flips[strips.starts[:-1]].any(), "strips", "a first triangle is flipped")
     source, rotation = strips.source_face, strips.rotation
     _expect(np.array_equal(np.sort(source), np.arange(len(faces))), "strips", "not each face stands once")
     _expect(len(rotation) == count and not (rotation > 2).any(), "strips", "a rotation is not 0, 1 or 2")
     corners = (np.arange(3) + rotation[:, None]) % 3
     turned = np.take_along_axis(faces[source], corners, axis=1)
-    wrong = (decode_strips(strips.vertices, strips.turns, strips.starts) != turned).any(axis=1)
-    _expect(not wrong.any(), "strips", f"triangle {wrong.argmax()} is not its source face")
+    decoded = decode_strips(strips.vertices, strips.turns, strips.starts, strips.flips)
+    wrong = np.flatnonzero((decoded != turned).any(axis=1))
+    _expect(len(wrong) == 0, "strips", f"triangle {next(iter(wrong), 0)} is not its source face")
 
 
 def _refuse_break(place: int, where: str) -> None:

@@ -22,7 +22,9 @@ Eurographics 2003), who want few strips and nothing else. Differences:
    since.
 6. Strips longer than LONGEST faces are left as they are, and a search ends after MOST_ROTATIONS: time is
    linear whatever the mesh.
-7. At the end each strip is written in the direction in which its balanced tree (the odd face goes to the
+7. On an edge of more than two faces an end may go on through a half-edge that is linked to another, if that
+   is the link that is cut.
+8. At the end each strip is written in the direction in which its balanced tree (the odd face goes to the
    first half) costs less.
 
 Cost: O(strips * 4^rotations * length) a pass, with each factor but the first bounded.
