@@ -1,6 +1,7 @@
 """Tracing on a GPU against the CPU path in the same process: the same hits, and rays a second.
 
-    python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5] [--record] [--note TEXT]
+    python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5] [--resident expanded compressed]
+        [--record] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed; ambient
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
@@ -22,6 +23,7 @@ import striptools
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
+from striptools.trace.tracer import ResidentKind
 
 PIXELS = 1024
 TILE = 8
@@ -35,6 +37,7 @@ def main() -> int:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--rays", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--resident", nargs="+", default=["expanded", "compressed"])
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--note", default="")
     arguments = parser.parse_args()
@@ -44,7 +47,7 @@ def main() -> int:
     differ = 0
     for path in arguments.models:
         scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
-        rows = measure(path.stem, scene, arguments)
+        rows = [row for kind in arguments.resident for row in measure(path.stem, scene, kind, arguments)]
         for row in rows:
             sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.6g} {row.unit} ({row.note})\n")
             sys.stdout.flush()
@@ -54,16 +57,19 @@ def main() -> int:
     return 1 if differ else 0
 
 
-def measure(name: str, scene: Scene, arguments: argparse.Namespace) -> list[Row]:
+def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse.Namespace) -> list[Row]:
     """Trace every kind of ray on both devices."""
-    gpu, cpu = Tracer(scene, device="gpu"), Tracer(scene, device="cpu")
+    gpu = Tracer(scene, device="gpu", resident=resident)
+    cpu = Tracer(scene, device="cpu", resident="expanded")
     device = str(gpu.devices[0].device_kind)
     rows = []
     for kind, rays in ray_kinds(scene, cpu, 2**arguments.rays):
         ours, wanted = gpu.closest_hit(*rays), cpu.closest_hit(*rays)
         wrong = int(((ours.face != wanted.face) | (ours.t.view(np.int32) != wanted.t.view(np.int32))).sum())
         wrong_any = int((gpu.any_hit(*rays) != (wanted.face >= 0)).sum())
-        note = "; ".join(filter(None, [f"{device}, {len(rays[0])} rays, whole calls", arguments.note]))
+        note = "; ".join(
+            filter(None, [f"{device}, {resident}, {len(rays[0])} rays, whole calls", arguments.note])
+        )
         count = scene.triangle_count
         rows += [
             Row("gpu", name, count, f"differing closest hits, {kind}", wrong, "rays", note=note),
