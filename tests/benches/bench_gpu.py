@@ -1,7 +1,7 @@
 """Tracing on a GPU against the CPU path in the same process: the same hits, and rays a second.
 
-    python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5] [--resident expanded compressed]
-        [--record] [--note TEXT]
+    python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5]
+        [--resident expanded compressed] [--record] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed; ambient
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
