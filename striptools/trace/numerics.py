@@ -36,15 +36,17 @@ def rounded(product: Array) -> Array:
 def quotient(a: Array, b: Array) -> Array:
     """a / b, rounded correctly on every platform: the same bits.
 
-    A CPU divides so. A GPU's own division may be one or two units off in the last place; that of float64 is
-    right, and rounding its result once more still is, because 53 bits are more than twice 24.
+    A CPU divides so. A GPU's own division may be a unit or two off in the last place. There float64 divides,
+    and its result, first rounded to 51 bits, is rounded to float32: still right, because 51 bits are more than
+    twice 24. Without the step between, LLVM would make a float32 division of it again.
     """
     return lax.platform_dependent(a, b, cpu=lax.div, default=_divided_in_double)
 
 
 def _divided_in_double(a: Array, b: Array) -> Array:
     with jax.enable_x64(True):
-        return (a.astype(jnp.float64) / b.astype(jnp.float64)).astype(jnp.float32)
+        exact = a.astype(jnp.float64) / b.astype(jnp.float64)
+        return lax.reduce_precision(exact, exponent_bits=11, mantissa_bits=50).astype(jnp.float32)
 
 
 def with_sign_of(a: Array, sign_bit: Array) -> Array:
