@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import book, clean_meshes, fan, grid, soup, sphere, stack
+from strategies import book, clean_meshes, fan, grid, soup, sphere, stack, tangle
 
 from striptools.errors import UsageError
 from striptools.kernels import strip_chunks, strip_tunnels
@@ -198,6 +198,15 @@ def test_flips_never_cost_more_than_they_save(mesh, most: int, effort: Effort, c
         assert as_lists(flipped) == as_lists(plain)
     else:
         assert (len(plain.starts) - len(flipped.starts)) * TRIANGLES_A_STRIP > len(one[0])
+
+
+@given(st.integers(3, 8), st.integers(1, 60), st.integers(0, 2**32 - 1))
+def test_rows_with_repeated_vertices_are_never_flipped_in_two_ways(vertices: int, count: int, seed: int):
+    positions, faces = tangle(vertices, count, seed)
+    one = prepared(positions, faces)
+    for effort in (None, EFFORTS["best"]):
+        strips = encode_strips(faces, order_cut(*one, cut_tree(one[3], 10**6), 64, effort))
+        check_strips(strips, faces)
 
 
 def moebius(quads: int) -> Arrays:

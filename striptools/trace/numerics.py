@@ -6,6 +6,7 @@ denormals, and has slow minimum and maximum operations. The functions here say w
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -30,6 +31,22 @@ def rounded(product: Array) -> Array:
     Not a number, and minus infinity, become the lowest finite value.
     """
     return jnp.where(product > LOWEST, product, LOWEST)
+
+
+def quotient(a: Array, b: Array) -> Array:
+    """a / b, rounded correctly on every platform: the same bits.
+
+    A CPU divides so. A GPU's own division may be a unit or two off in the last place. There float64 divides,
+    and its result, first rounded to 51 bits, is rounded to float32: still right, because 51 bits are more than
+    twice 24. Without the step between, LLVM would make a float32 division of it again.
+    """
+    return lax.platform_dependent(a, b, cpu=lax.div, default=_divided_in_double)
+
+
+def _divided_in_double(a: Array, b: Array) -> Array:
+    with jax.enable_x64(True):
+        exact = a.astype(jnp.float64) / b.astype(jnp.float64)
+        return lax.reduce_precision(exact, exponent_bits=11, mantissa_bits=50).astype(jnp.float32)
 
 
 def with_sign_of(a: Array, sign_bit: Array) -> Array:

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from striptools.trace.numerics import SIGN, larger, rounded, smaller, with_sign_of
+from striptools.trace.numerics import SIGN, larger, quotient, rounded, smaller, with_sign_of
 
 Corners = tuple[Array, Array, Array]
 """One coordinate of the three corners a, b, c of a triangle, or (8,) each of a leaf's lanes."""
@@ -71,9 +71,9 @@ def shear_of(origin: Array, direction: Array) -> Shear:
     return Shear(
         axes,
         (pick(origin, x), pick(origin, y), pick(origin, z)),
-        pick(direction, x) / depth,
-        pick(direction, y) / depth,
-        1 / depth,
+        quotient(pick(direction, x), depth),
+        quotient(pick(direction, y), depth),
+        quotient(jnp.ones_like(depth), depth),
     )
 
 
@@ -117,7 +117,7 @@ def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
     scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
-    return lax.optimization_barrier(scaled_t / with_sign_of(determinant, sign))
+    return lax.optimization_barrier(quotient(scaled_t, with_sign_of(determinant, sign)))
 
 
 def _summed(a: Array, b: Array, c: Array, turn: Array | None) -> Array:

@@ -32,7 +32,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, slab_of
-from striptools.trace.numerics import folded, index, larger, power_of_two_below, smaller
+from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
 from striptools.trace.triangle import Shear, shear_of
 
 WIDTH = 8
@@ -280,7 +280,7 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
     slab = slab_of(origin, direction, frame)
     shear = shear_of(origin, direction)
-    rest = [*shear.origin, shear.x, shear.y, shear.z, t_max * length * frame.scale, shorten / frame.scale]
+    rest = [*shear.origin, shear.x, shear.y, shear.z, t_max * length * frame.scale, quotient(shorten, frame.scale)]
     floats = jnp.concatenate([slab.low, slab.high, slab.inverse, jnp.stack(rest)])
     start = jnp.where(valid, DONE, 0)
     zero = jnp.int32(0)
