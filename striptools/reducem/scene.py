@@ -374,8 +374,8 @@ class Scene:
     def resident_bytes_per_triangle(self) -> float:
         """Say what tracing without unpacking holds, over the triangles.
 
-        That is the blocks and the complete hierarchy as a file with boxes stored has them, but for runs, of which
-        a tracer keeps a word each; neither the remap nor the few per cent by which it rounds arrays up.
+        That is the blocks and the complete hierarchy as a file with boxes stored has them, but for runs, of
+        which a tracer keeps a word each; neither the remap nor the few per cent by which it rounds arrays up.
         """
         packed = self.with_boxes()
         held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run]

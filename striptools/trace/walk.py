@@ -280,7 +280,14 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
     slab = slab_of(origin, direction, frame)
     shear = shear_of(origin, direction)
-    rest = [*shear.origin, shear.x, shear.y, shear.z, t_max * length * frame.scale, quotient(shorten, frame.scale)]
+    rest = [
+        *shear.origin,
+        shear.x,
+        shear.y,
+        shear.z,
+        t_max * length * frame.scale,
+        quotient(shorten, frame.scale),
+    ]
     floats = jnp.concatenate([slab.low, slab.high, slab.inverse, jnp.stack(rest)])
     start = jnp.where(valid, DONE, 0)
     zero = jnp.int32(0)
