@@ -1,17 +1,19 @@
 """The whole way on real models: convert, verify, convert back, and what each costs.
 
-    python tests/benches/bench_pipeline.py FOLDER [MESH ...] [--record]
+    python tests/benches/bench_pipeline.py FOLDER [MESH ...] [--bits 20 16 12] [--record]
 
 FOLDER holds `MESH.ply` files. Each model has a process of its own. There a small mesh is converted first,
 which brings in all imports and compiled kernels; the first conversion of the model then gives the peak of
 memory, and the second one the seconds.
-`--record` appends the figures to `results.csv`.
+With `--bits` the scenes on these grids are verified instead: against their own decoded meshes exactly, and
+against the source within the bound that they declare. `--record` appends the figures to `results.csv`.
 """
 
 import argparse
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,7 +23,8 @@ from results import Row, append
 import striptools
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh, save_mesh
-from striptools.pipeline import STAGES
+from striptools.pipeline import STAGES, Options
+from striptools.reducem.quantize import PrecisionOptions
 
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
@@ -29,22 +32,30 @@ MESHES = (
 )  # fmt: skip
 
 
+FAULTS = ("disagreements", "leaks", "faces lost on the way back")
+"""What there must be none of."""
+
+
 def main() -> int:
     """Measure each model, print its row, and say how many failed."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("meshes", nargs="*", default=MESHES)
+    parser.add_argument("--bits", nargs="+", type=int, default=[])
     parser.add_argument("--record", action="store_true")
     arguments = parser.parse_args()
     failed = 0
     for name in arguments.meshes:
+        path = arguments.folder / f"{name}.ply"
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-            rows = process.submit(measure, name, arguments.folder / f"{name}.ply").result()
-        figures = {row.metric: row.value for row in rows}
-        line = ", ".join(f"{key} {value:.6g}" for key, value in figures.items())
+            if arguments.bits:
+                rows = process.submit(measure_grids, name, path, arguments.bits).result()
+            else:
+                rows = process.submit(measure, name, path).result()
+        line = ", ".join(f"{row.metric} {row.value:.6g} {row.note}".strip() for row in rows)
         sys.stdout.write(f"{name}: {line}\n")
         sys.stdout.flush()
-        failed += bool(figures["disagreements"] or figures["leaks"] or figures["faces lost on the way back"])
+        failed += any(row.value for row in rows if row.metric.split(",")[0] in FAULTS)
         if arguments.record:
             append(rows)
     return 1 if failed else 0
@@ -80,6 +91,30 @@ def measure(name: str, path: Path) -> list[Row]:
         ("faces lost on the way back", lost, "faces"),
     ]
     return [Row("pipeline", name, triangles, metric, value, unit) for metric, value, unit in figures]
+
+
+def measure_grids(name: str, path: Path, widths: list[int]) -> list[Row]:
+    """Verify one model on grids, against what was decoded and against the source."""
+    from striptools.measure.verify import verify
+
+    source = load_mesh(path)
+    rows = []
+    for width in widths:
+        scene = striptools.convert(source, Options(precision=PrecisionOptions(bits=width)))
+        exact = replace(scene, remap=None, source_face_count=scene.triangle_count, error_bound=0.0)
+        for title, traced, mesh in (
+            ("decoded mesh", exact, exact.to_mesh()),
+            ("source", scene, source),
+        ):
+            proof = verify(traced, mesh)
+            note = f"{width} bits, bound {traced.error_bound:.3g}, {proof.rays} rays"
+            for metric, value in (("disagreements", proof.disagreements), ("leaks", proof.leaks)):
+                rows.append(
+                    Row(
+                        "pipeline", name, scene.triangle_count, f"{metric}, {title}", value, "rays", note=note
+                    )
+                )
+    return rows
 
 
 def warm_up() -> None:
