@@ -125,12 +125,15 @@ def classic_row(name: str, mesh: Mesh, one: Outcome, peer: Outcome | None) -> Ro
 
 
 def generalised(name: str, mesh: Mesh) -> list[Row]:
-    """Vertices per triangle and relative cost of the strips that a scene stores, whole and in blocks."""
+    """Vertices per triangle and relative cost of the strips that a scene stores.
+
+    They are ordered in chunks and grouped into blocks afterwards, or ordered inside blocks, as by default.
+    """
     rows = []
     cases = {
-        "normal": OrderingOptions(),
-        "best": OrderingOptions(effort="best"),
-        "blocks of 256": OrderingOptions(max_length=64, block=256),
+        "in chunks, normal": OrderingOptions(block=None),
+        "in chunks, best": OrderingOptions(block=None, effort="best"),
+        "in blocks of 256": OrderingOptions(),
         "as the paper has it": OrderingOptions(method="paper"),
     }
     for case, ordering in cases.items():
