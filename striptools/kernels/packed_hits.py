@@ -252,6 +252,7 @@ def weigh_packed_hits(
         triangle: (r,) int32, written; -1 on a miss.
     """
     weights = np.zeros(3, np.float32)
+    room = np.zeros((4, 3), np.float32)
     decoded = np.zeros((3, 3), np.float32)
     corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
@@ -279,6 +280,6 @@ def weigh_packed_hits(
         # Weigh its corners, named as the reported face does.
         if len(rotations) > 0:
             turn = (turn + rotations[triangle[r]]) % 3
-        weigh_corners(origins, directions, r, scale, corners, turn, weights)
+        weigh_corners(origins, directions, r, scale, corners, turn, room, weights)
         u[r] = weights[1]
         v[r] = weights[2]

@@ -299,7 +299,7 @@ def fill_leaf_blocks(
 
 
 @kernel
-def weigh_corners(origins, directions, r, scale, corners, turn, weights):
+def weigh_corners(origins, directions, r, scale, corners, turn, room, weights):
     """Where on its face a hit lies: the watertight test's own edge functions, once, for the face hit.
 
     Args:
@@ -309,12 +309,10 @@ def weigh_corners(origins, directions, r, scale, corners, turn, weights):
         scale: float32, what corners were multiplied by.
         corners: (3, 3) float32, scaled, a row a corner, in the order of the tests.
         turn: Corner j is the face's corner (j + turn) % 3.
+        room: (4, 3) float32.
         weights: (3,) float32, written: of the face's corners.
     """
-    way = np.zeros(3, np.float32)
-    start = np.zeros(3, np.float32)
-    x = np.zeros(3, np.float32)
-    y = np.zeros(3, np.float32)
+    way, start, x, y = room[0], room[1], room[2], room[3]
 
     # Take the ray as the walk does, which reads denormals as zero.
     for axis in range(3):
@@ -369,6 +367,7 @@ def weigh_hits(
         triangle: (r,) int32, written; -1 on a miss.
     """
     weights = np.zeros(3, np.float32)
+    room = np.zeros((4, 3), np.float32)
     corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
         r = at[k]
@@ -384,6 +383,6 @@ def weigh_hits(
         for j in range(3):
             for axis in range(3):
                 corners[j, axis] = blocks[slot >> 5, 3 * axis + j, (slot >> 2) & 7]
-        weigh_corners(origins, directions, r, scale, corners, slot & 3, weights)
+        weigh_corners(origins, directions, r, scale, corners, slot & 3, room, weights)
         u[r] = weights[1]
         v[r] = weights[2]
