@@ -446,6 +446,18 @@ def test_no_colour_and_no_progress_in_pipes(folder: Path, tmp_path: Path) -> Non
         assert b"\x1b" not in done.stdout + done.stderr
 
 
+def test_block_0_orders_in_chunks_and_groups_the_strips_afterwards(run, folder: Path, tmp_path: Path) -> None:
+    figures = {}
+    for block in (0, 64):
+        assert run("convert", folder / "torus.ply", tmp_path / f"{block}.rdm", "--block", block)[0] == 0
+        facts = json.loads(run("info", tmp_path / f"{block}.rdm", "--format", "json")[1])
+        figures[block] = facts["vertices_per_triangle"]
+    assert figures[0] < figures[64]
+    code, _, err = run("convert", folder / "torus.ply", tmp_path / "one.rdm", "--block", 1)
+    assert code == 2
+    assert "block" in err
+
+
 # Reports
 
 

@@ -136,10 +136,11 @@ def run(
     block: Annotated[
         int,
         typer.Option(
-            min=SMALLEST_BLOCK,
+            min=0,
             max=LARGEST_STRIP_BLOCK,
             metavar="N",
-            help="Most triangles and most vertices of a block.",
+            help=f"Most triangles and most vertices of a block, {SMALLEST_BLOCK} or more; 0 orders strips in "
+            "chunks, and puts them into blocks of the largest size afterwards (strip-rt).",
         ),
     ] = LARGEST_STRIP_BLOCK,
     flips: Annotated[
@@ -202,7 +203,7 @@ def run(
             cast(EffortName, effort),
             distance_weight,
             balance_weight,
-            block,
+            block or None,
             flips,
         ),
         precision=_precision(bits, max_error),
