@@ -217,8 +217,8 @@ def _refuse(flaw: tuple[int, int], section: str, where: str) -> None:
 
 
 # Notes. Block sizes, lossless: vertices per triangle, bytes a triangle of the file and as traced with boxes,
-# duplication of vertices, expected cost over a full SAH tree's; then rays a second of expanded and of compressed
-# tracing, camera / ambient occlusion, over expanded blocks of 256 (one thread, the least of seven runs):
+# duplication of vertices, expected cost over a full SAH tree's; then rays a second of expanded and of
+# compressed tracing, camera / ambient occlusion, over expanded blocks of 256 (one thread, least of 7 runs):
 #
 #     dragon  64   1.141   7.27  10.07   1.449  1.066   1.05 / 0.99   0.69 / 0.74
 #            128   1.107   6.61   9.05   1.312  1.080   1.02 / 0.99   0.65 / 0.74
@@ -227,6 +227,6 @@ def _refuse(flaw: tuple[int, int], section: str, where: str) -> None:
 #            128   1.143   7.98  10.57   1.493  1.121   1.01 / 0.98   0.58 / 0.59
 #            256   1.112   7.54   9.94   1.372  1.138   1.00 / 1.00   0.56 / 0.59
 #
-# 256, the largest that local numbers of 8 bits allow, is the default: it is the smallest file by 5 to 6 %, and
-# the hierarchy that is 1 to 2 % dearer costs traced rays less than that. Boxes inside blocks are rebuilt by
+# 256, the largest that local numbers of 8 bits allow, is the default: it gives the smallest file by 5 to 6 %,
+# and the hierarchy that is 1 to 2 % dearer costs traced rays less than that. Boxes inside blocks are rebuilt by
 # default: stored ones are a quarter of the file, and 871,000 triangles get them back in 0.045 s.
