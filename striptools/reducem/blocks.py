@@ -227,6 +227,7 @@ def _refuse(flaw: tuple[int, int], section: str, where: str) -> None:
 #            128   1.143   7.98  10.57   1.493  1.121   1.01 / 0.98   0.58 / 0.59
 #            256   1.112   7.54   9.94   1.372  1.138   1.00 / 1.00   0.56 / 0.59
 #
-# 256, the largest that local numbers of 8 bits allow, is the default: it gives the smallest file by 5 to 6 %,
-# and the hierarchy that is 1 to 2 % dearer costs traced rays less than that. Boxes inside blocks are rebuilt by
-# default: stored ones are a quarter of the file, and 871,000 triangles get them back in 0.045 s.
+# 256, the largest that local numbers of 8 bits allow, is the default: it gives the smallest file by 5 to
+# 6 %, and the hierarchy that is 1 to 2 % dearer costs traced rays less than that. Boxes inside blocks are
+# rebuilt by default: stored ones are a quarter of the file, and 871,000 triangles get them back in 0.045
+# s.

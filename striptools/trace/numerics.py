@@ -36,9 +36,9 @@ def rounded(product: Array) -> Array:
 def quotient(a: Array, b: Array) -> Array:
     """Divide a by b, rounded correctly on every platform: the same bits.
 
-    A CPU divides so. A GPU's own division may be a unit or two off in the last place. There float64 divides, and
-    its result, first rounded to 51 bits, is rounded to float32: still right, because 51 bits are more than twice
-    24. Without the step between, LLVM would make a float32 division of it again.
+    A CPU divides so. A GPU's own division may be a unit or two off in the last place. There float64
+    divides, and its result, first rounded to 51 bits, is rounded to float32: still right, because 51 bits
+    are more than twice 24. Without the step between, LLVM would make a float32 division of it again.
     """
     return lax.platform_dependent(a, b, cpu=lax.div, default=_divided_in_double)
 
