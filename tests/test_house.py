@@ -101,3 +101,34 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
     assert ci[-1] == commands[1]
     assert commands[1] in (ROOT / "CONTRIBUTING.md").read_text()
     assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
+
+
+def test_only_kernels_call_what_python_cannot():
+    """A helper has no wrapper: Python that calls it, or imports it to do so, would crash."""
+    hidden = {}
+    for file in (ROOT / "striptools" / "kernels").glob("*.py"):
+        found = re.findall(r"^@(maker|helper|inlined|spliced)\ndef (\w+)", file.read_text(), re.MULTILINE)
+        hidden[file.stem] = {name for _, name in found}
+    assert sum(map(len, hidden.values())) > 20
+    callers = [file for folder in ("striptools", "cli", "samples") for file in (ROOT / folder).rglob("*.py")]
+    for file in callers:
+        if file.parent.name != "kernels":
+            assert not _hidden_names(file.read_text(), hidden), file
+
+
+def _hidden_names(text: str, hidden: dict[str, set[str]]) -> set[str]:
+    """The hidden kernels that a module imports by name or takes from a module of kernels."""
+    found = set()
+    for module, names in re.findall(r"from striptools\.kernels\.(\w+) import \(?([\w\s,]+)", text):
+        found |= hidden.get(module, set()) & set(re.findall(r"\w+", names))
+    for module, alias in re.findall(r"from striptools\.kernels import (\w+)(?: as (\w+))?", text):
+        used = set(re.findall(rf"\b{alias or module}\.(\w+)", text))
+        found |= hidden.get(module, set()) & used
+    return found
+
+
+def test_a_hidden_kernel_is_found():
+    hidden = {"boxes": {"grow"}}
+    assert _hidden_names("from striptools.kernels.boxes import area, grow\n", hidden) == {"grow"}
+    assert _hidden_names("from striptools.kernels import boxes as b\nb.grow(1)\n", hidden) == {"grow"}
+    assert not _hidden_names("from striptools.kernels import boxes\nboxes.area(1)\n", hidden)
