@@ -359,29 +359,29 @@ def _tell_no_one(_stage: str, _fraction: float) -> None:
     pass
 
 
-# Notes. Strip-RT's lead in primary / secondary rays a second: one study a mesh, 7 runs on two busy cores
-# (rows of one and the same scene differed by up to 5 %), 1024 x 1024 primary rays, longest strip 128. The
-# paper has 1.05-1.59 over STRIPE and 1.08-1.87 over Tipsify. "Short": Strip-RT at no more memory than
-# Tipsify, over Tipsify. "Joined": Strip-RT over Tipsify's strips joined, in order, until there are as many as
-# Strip-RT's, each with one balanced tree; this was tried apart, for no strip can be stored like that.
+# Notes. Strip-RT's lead in primary / secondary rays a second and what a triangle takes, in blocks of 256: one
+# study a mesh, 7 runs on two busy cores (rows of one and the same scene differed by up to 5 %), 1024 x 1024
+# primary rays. The paper has 1.05-1.59 over STRIPE and 1.08-1.87 over Tipsify, whose bytes are Strip-RT's within
+# 5.5 %. The baselines order the whole mesh; their strips are then put into blocks by a SAH split over them.
 #
-#     mesh                STRIPE-like    Tipsify        short          joined
-#     bunny               1.58 / 1.55    1.08 / 1.12    1.15 / 1.31    1.36 / 1.29
-#     chandelier          1.33 / 1.46    1.35 / 1.61    1.33 / 1.61    1.79 / 1.65
-#     kicad_acepack       1.38 / 1.22    1.57 / 1.08    1.12 / 1.01
-#     dem_jacksboro       1.88 / 3.58    1.04 / 0.96    1.05 / 1.20    1.45 / 1.76
-#     icub                1.38 / 1.46    1.15 / 1.25    1.17 / 1.33
-#     tree_japanesemaple  1.07 / 1.14    1.13 / 1.26    1.27 / 1.35
-#     ugly_bunny_holes    1.13 / 1.24    1.03 / 1.10    1.07 / 1.26    1.39 / 1.23
-#     dragon              1.25 / 1.31    1.12 / 1.21    1.16 / 1.23    1.42 / 1.21
-#     dragon_3m5          1.45 / 1.62    1.08 / 1.06    1.17 / 1.17
-#     powerplant          1.18 / 0.99    2.02 / 0.96    1.87 / 0.96
+#     mesh                STRIPE-like    Tipsify        bytes: Strip-RT, STRIPE-like, Tipsify
+#     bunny               1.39 / 1.58    1.19 / 1.26    6.70  8.41  7.37
+#     chandelier          1.24 / 1.35    1.22 / 1.25    6.86  6.36  6.83
+#     kicad_acepack       1.35 / 1.02    1.41 / 0.93    7.65  7.21  8.18
+#     dem_jacksboro       1.43 / 1.79    1.26 / 1.31    5.18  8.05  5.70
+#     icub                1.36 / 1.51    1.17 / 1.29    7.54  7.73  8.10
+#     tree_japanesemaple  1.06 / 1.09    1.17 / 1.28    7.51  6.58  7.06
+#     ugly_bunny_holes    1.25 / 1.35    1.11 / 1.14    6.76  7.65  7.30
+#     dragon              1.24 / 1.18    1.23 / 1.28    6.29  6.88  6.80
+#     dragon_3m5          1.27 / 1.54    1.21 / 1.31    6.05  7.33  6.63
+#     powerplant          1.44 / 0.83    3.25 / 1.62    7.15  6.87  7.03
 #
-# Where the lead over Tipsify is small or none, memory is the reason. In the paper Tipsify takes as many bytes
-# as Strip-RT, so its strips must be as long. Here an order that breaks ends a strip: Tipsify's have 5 to 6
-# triangles, take half as many bytes again (chandelier: 6 % more), and are compact for being short. With
-# strips as long as Strip-RT's the lead is the paper's. On the power plant secondary rays meet long thin
-# triangles: the halves of a strip have 1.94 of its area, whoever made it, every variant costs 0.99 to 1.01 of
-# a full tree, and no order of triangles can win. STRIPE-like strips take the LEAST memory here, 1 to 8 %
-# below Strip-RT's, for turn bits are free; the paper's STRIPE mostly takes the most, for swaps. On a regular
-# grid they run from border to border (dem_jacksboro: 11.6 of a full tree's cost).
+# Before strips were stored in blocks the lead over Tipsify was smaller (0.96 to 1.61 for secondary rays): its
+# strips, ended wherever the order breaks, took half as many bytes again and were compact for being short.
+#
+# Where Strip-RT is not ahead, the blocks are the reason. They are cut from the object tree in alignment with
+# whole blocks, which puts large triangles beside small ones; strips that are grouped afterwards are split by
+# SAH alone. On the power plant's long thin pipes the first costs 1.019 of a full SAH tree, the second 0.988 to
+# 0.999 whoever made the strips (Strip-RT with `--block 0`: 0.993), so that STRIPE-like strips are walked in 42
+# steps against 46; the halves of a strip have 1.94 of its area there, and no order of triangles can win. On
+# kicad_acepack secondary rays take two steps in all, and rows differ by what runs of one row do.
