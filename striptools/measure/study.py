@@ -359,10 +359,11 @@ def _tell_no_one(_stage: str, _fraction: float) -> None:
     pass
 
 
-# Notes. Strip-RT's lead in primary / secondary rays a second and what a triangle takes, in blocks of 256: one
-# study a mesh, 7 runs on two busy cores (rows of one and the same scene differed by up to 5 %), 1024 x 1024
-# primary rays. The paper has 1.05-1.59 over STRIPE and 1.08-1.87 over Tipsify, whose bytes are Strip-RT's within
-# 5.5 %. The baselines order the whole mesh; their strips are then put into blocks by a SAH split over them.
+# Notes. Strip-RT's lead in primary / secondary rays a second and what a triangle takes, in blocks of 256:
+# one study a mesh, 7 runs on two busy cores (rows of one and the same scene differed by up to 5 %), 1024
+# x 1024 primary rays. The paper has 1.05-1.59 over STRIPE and 1.08-1.87 over Tipsify, whose bytes are
+# Strip-RT's within 5.5 %. The baselines order the whole mesh; their strips are then put into blocks by a
+# SAH split over them.
 #
 #     mesh                STRIPE-like    Tipsify        bytes: Strip-RT, STRIPE-like, Tipsify
 #     bunny               1.39 / 1.58    1.19 / 1.26    6.70  8.41  7.37
@@ -376,12 +377,14 @@ def _tell_no_one(_stage: str, _fraction: float) -> None:
 #     dragon_3m5          1.27 / 1.54    1.21 / 1.31    6.05  7.33  6.63
 #     powerplant          1.44 / 0.83    3.25 / 1.62    7.15  6.87  7.03
 #
-# Before strips were stored in blocks the lead over Tipsify was smaller (0.96 to 1.61 for secondary rays): its
-# strips, ended wherever the order breaks, took half as many bytes again and were compact for being short.
+# Before strips were stored in blocks the lead over Tipsify was smaller (0.96 to 1.61 for secondary rays):
+# its strips, ended wherever the order breaks, took half as many bytes again and were compact for being
+# short.
 #
-# Where Strip-RT is not ahead, the blocks are the reason. They are cut from the object tree in alignment with
-# whole blocks, which puts large triangles beside small ones; strips that are grouped afterwards are split by
-# SAH alone. On the power plant's long thin pipes the first costs 1.019 of a full SAH tree, the second 0.988 to
-# 0.999 whoever made the strips (Strip-RT with `--block 0`: 0.993), so that STRIPE-like strips are walked in 42
-# steps against 46; the halves of a strip have 1.94 of its area there, and no order of triangles can win. On
-# kicad_acepack secondary rays take two steps in all, and rows differ by what runs of one row do.
+# Where Strip-RT is not ahead, the blocks are the reason. They are cut from the object tree in alignment
+# with whole blocks, which puts large triangles beside small ones; strips that are grouped afterwards are
+# split by SAH alone. On the power plant's long thin pipes the first costs 1.019 of a full SAH tree, the
+# second 0.988 to 0.999 whoever made the strips (Strip-RT with `--block 0`: 0.993), so that STRIPE-like
+# strips are walked in 42 steps against 46; the halves of a strip have 1.94 of its area there, and no
+# order of triangles can win. On kicad_acepack secondary rays take two steps in all, and rows differ by
+# what runs of one row do.
