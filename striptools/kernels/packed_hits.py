@@ -143,11 +143,10 @@ def bits_set(number):
     return number * 0x01010101 >> 24 & 0xFF
 
 
-@kernel
-def corner_indices(headers, words, block, t):
-    """The indices of triangle t of a block: SPEC 4.3, alone."""
-    count, _, _, has_flips, width = block_counts(headers, block)
-    bit = np.int64(headers[block, 1]) << 5
+@inlined
+def corner_indices(words, bit, counts, t):
+    """The indices of triangle t of a block of these counts, its data from `bit` on: SPEC 4.3, alone."""
+    count, _, _, has_flips, width = counts
 
     # Find the strip.
     strip = np.int64(-1)
@@ -182,14 +181,14 @@ def power_of_two(exponent):
     return np.int64((exponent + 1023) << 52).view(np.float64)
 
 
-@kernel
-def scaled_corners(headers, words, block, indices, scale_exponent, corners):
+@inlined
+def scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, corners):
     """Fill corners (3, 3) float32, a row each, with three of a block's vertices times 2**scale_exponent.
 
     What is not a normal number then is zero, as the walks have it.
     """
-    count, _, strips, has_flips, index_width = block_counts(headers, block)
-    begin = (np.int64(headers[block, 1]) << 5) + (2 + has_flips) * count + (count + 2 * strips) * index_width
+    count, _, strips, has_flips, index_width = counts
+    begin = bit + (2 + has_flips) * count + (count + 2 * strips) * index_width
     stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
     for axis in range(3):
         mode, width, anchor, exponent = axis_of(headers, block, axis)
@@ -270,8 +269,10 @@ def weigh_packed_hits(
 
         # Decode the triangle, and turn it as the tests do.
         block = block_of(headers, triangle[r])
-        indices = corner_indices(headers, words, block, np.int64(triangle[r]) - np.int64(headers[block, 0]))
-        scaled_corners(headers, words, block, indices, scale_exponent, decoded)
+        bit = np.int64(headers[block, 1]) << 5
+        counts = block_counts(headers, block)
+        indices = corner_indices(words, bit, counts, np.int64(triangle[r]) - np.int64(headers[block, 0]))
+        scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
         turn = first_corner(decoded)
         for j in range(3):
             for axis in range(3):
