@@ -144,17 +144,24 @@ def bits_set(number):
 
 
 @inlined
+def highest_bit(number):
+    """The place of the highest bit that is set of a number below 2**32, not zero: a float's exponent."""
+    return (np.float64(number).view(np.int64) >> 52) - 1023
+
+
+@inlined
 def corner_indices(words, bit, counts, t):
     """The indices of triangle t of a block of these counts, its data from `bit` on: SPEC 4.3, alone."""
     count, _, _, has_flips, width = counts
 
-    # Find the strip.
+    # Find the strip, and its first triangle, the last one up to t at which a strip starts.
     strip = np.int64(-1)
+    first = np.int64(0)
     for k in range(0, t + 1, 32):
-        strip += bits_set(take(words, bit + k, min(t + 1 - k, 32)))
-    first = t
-    while take(words, bit + first, 1) == 0:
-        first -= 1
+        starts = take(words, bit + k, min(t + 1 - k, 32))
+        if starts != 0:
+            strip += bits_set(starts)
+            first = k + highest_bit(starts)
 
     # Find the last other turn.
     turn = take(words, bit + count + t, 1)
