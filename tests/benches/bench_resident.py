@@ -2,8 +2,8 @@
 
     python tests/benches/bench_resident.py MODEL [MODEL ...] [--repeats 21] [--record] [--note TEXT]
 
-MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, and ambient occlusion from what
-it sees, closest hit and any hit. Times are of the processor, so that other work on the machine tells less; a
+MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, all of its picture and a run from
+the middle, and ambient occlusion from what it sees, closest hit and any hit. Times are of the processor, so that other work on the machine tells less; a
 ratio is the median of the ratios of runs next to each other. Bytes are of all arrays that a tracer keeps.
 """
 
@@ -59,6 +59,7 @@ def measure(name: str, scene: Scene, repeats: int, note: str) -> list[Row]:
     seen = wide.closest_hit(*camera).triangle
     occlusion = middle(occlusion_rays(scene.positions[scene.faces()], camera, seen))
     for metric, rays, call in (
+        ("camera rays, the whole picture, closest hit", camera, "closest_hit"),
         ("camera rays, closest hit", middle(camera), "closest_hit"),
         ("AO rays, closest hit", occlusion, "closest_hit"),
         ("AO rays, any hit", occlusion, "any_hit"),
