@@ -2,9 +2,10 @@
 
     python tests/benches/bench_resident.py MODEL [MODEL ...] [--repeats 21] [--record] [--note TEXT]
 
-MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, all of its picture and a run from
-the middle, and ambient occlusion from what it sees, closest hit and any hit. Times are of the processor, so that other work on the machine tells less; a
-ratio is the median of the ratios of runs next to each other. Bytes are of all arrays that a tracer keeps.
+MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, all of its picture and a run
+from the middle, and ambient occlusion from what it sees, closest hit and any hit. Times are of the processor,
+so that other work on the machine tells less; a ratio is the median of the ratios of runs next to each other.
+Bytes are of all arrays that a tracer keeps.
 """
 
 import argparse
