@@ -242,7 +242,8 @@ def _decompressed(stored: memoryview, length: int | None, most: int, where: str)
         # A frame of a single segment has no window of its own: its content is the window.
         largest = 1 << layout.LARGEST_WINDOW
         wrong = known and (frame.content_size > most if length is None else frame.content_size != length)
-        if frame.dict_id or frame.window_size > largest or wrong:
+        # The field of a dictionary must not be there, not even for dictionary 0, which is none.
+        if stored[4] & 3 or frame.window_size > largest or wrong:
             raise unreadable("RDM121", where)
         decoder = library.ZstdDecompressor(max_window_size=largest)
         content = decoder.decompress(stored, max_output_size=most, allow_extra_data=False)

@@ -143,7 +143,8 @@ def _values(
     stream = np.unpackbits(np.frombuffer(section.data, np.uint8, end - begin, begin), bitorder="little")
     if stream[bits:].any():
         inspection.found("RDM527", place, section.at(begin + bits // 8))
-    if not alone:
+    # Where there is one row no index is stored, and a count that no bytes bear out must not be believed.
+    if record.width:
         _indices(inspection, section, record, begin, _numbers(stream[:bits], count, record.width))
     return end
 

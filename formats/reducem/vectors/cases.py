@@ -87,6 +87,12 @@ def frame(data: bytes, *, kind: int = 0, descriptor: int = 0xE0, tail: bytes = b
     return head + block + (data[:1] if kind else data) + tail
 
 
+def _with_dictionary_0(data: bytes) -> bytes:
+    """A frame of one block whose header names dictionary 0 in four bytes."""
+    plain = frame(data)
+    return plain[:4] + bytes([0xE3]) + bytes(4) + plain[5:]
+
+
 # Valid ones
 
 TRIANGLE = Block([Strip([0, 1, 2])], [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 3.0, 1.0)])
@@ -1109,6 +1115,12 @@ def _values() -> dict[str, tuple[str, list[str], bytes]]:
         "values_unused": of("a row that nothing has", "RDM525", COLOURS._replace(index=[0, 1, 1, 0])),
         "values_equal": of("a row twice", "RDM526", COLOURS._replace(rows=[(1, 2, 3), (0, 0, 0), (1, 2, 3)])),
         "values_filler": of("an unused byte behind the rows", "RDM527", COLOURS._replace(filler=1)),
+        "values_of_a_huge_count": of(
+            "a row for four thousand million triangles that are not there",
+            "RDM201",
+            Values("COLR", 2, 1, [(1, 2, 3)], [0] * 4),
+            record={"triangle_count": 2**32 - 65536, "source_face_count": 2**32 - 1},
+        ),
         "values_tail": of("an unused bit behind the indices", "RDM527", COLOURS._replace(tail=1 << 23)),
         "values_empty": wrong(
             "an empty scene with values", "RDM117", Plan([]), payloads={"ATTR": lambda _: b"x"}
@@ -1250,6 +1262,9 @@ def _packed() -> dict[str, tuple[str, list[str], bytes]]:
         "packed_other_length": pack("a frame of another length", "RDM121", lambda data: frame(data[:-1])),
         "packed_dictionary": pack(
             "a frame with a dictionary", "RDM121", lambda data: frame(data, descriptor=0xE1)
+        ),
+        "packed_dictionary_0": pack(
+            "a frame with the field of a dictionary, which is none", "RDM121", _with_dictionary_0
         ),
         "packed_window": pack("a window of 2^28 bytes", "RDM121", lambda data: _window(data, 0x90)),
         "packed_checksum": pack(
