@@ -749,6 +749,9 @@ def _records() -> dict[str, tuple[str, list[str], bytes]]:
         "low_minus_zero": field("low is written as -0.0", "RDM205", ONE, low_y=-0.0),
         "high": field("high is not the largest coordinate", "RDM205", ONE, high_z=0.5),
         "high_nan": field("high is no number", "RDM205", ONE, high_z=nan),
+        "low_signalling_nan": wrong(
+            "low is a signalling NaN", "RDM205", BOX, payloads={"SCEN": patched(44, "I", 0x7F800001)}
+        ),
         "cell_low": field("cells finer than any", "RDM206", ONE, cell_x=-150),
         "cell_high": field("cells coarser than any", "RDM206", ONE, cell_z=128),
         "longest_none": field("stored boxes and no longest run", "RDM207 RDM802", BOX, longest_run=0),
