@@ -29,7 +29,6 @@ BLOCK_FLIPS = 1
 """The bit of a block header's flags that says that there are flip bits."""
 
 SOURCE_FACE_LIMIT = 2**32 - 1
-TRIANGLE_LIMIT = 2**32 - 1
 BLOCK_LIMIT = 2**24
 NODE_LIMIT = 2**28
 BLOCK_TRIANGLES = 256
