@@ -65,11 +65,8 @@ def take(words, bit, width):
 
 @kernel
 def bit_width(number):
-    """The least w with number < 2**w."""
-    width = 0
-    while number >> width:
-        width += 1
-    return width
+    """The least w with number < 2**w, of a number below 2**53: the exponent of a float."""
+    return (np.float64(number).view(np.int64) >> 52) - 1022 if number > 0 else 0
 
 
 @inlined

@@ -120,20 +120,6 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
             described[run] = first | length << 8 | strip_of[first] << 11 | turns << 19 | back << 27
 
 
-@kernel
-def block_of(headers, triangle):
-    """The block that a triangle in file order is in."""
-    low = np.int64(0)
-    high = np.int64(len(headers))
-    while high - low > 1:
-        middle = (low + high) >> 1
-        if np.int64(headers[middle, 0]) <= triangle:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
 @inlined
 def bits_set(number):
     """How many bits of a number below 2**32 are set."""
@@ -159,15 +145,16 @@ def corner_indices(words, bit, counts, t):
     first = np.int64(0)
     for k in range(0, t + 1, 32):
         starts = take(words, bit + k, min(t + 1 - k, 32))
-        if starts != 0:
-            strip += bits_set(starts)
-            first = k + highest_bit(starts)
+        strip += bits_set(starts)
+        first = k + highest_bit(starts) if starts != 0 else first
 
-    # Find the last other turn.
-    turn = take(words, bit + count + t, 1)
-    last = t
-    while last > first and take(words, bit + count + last, 1) == turn:
-        last -= 1
+    # Find the last other turn: no more than 30 in a row are equal.
+    begin = max(first + 1, t - 31)
+    size = t + 1 - begin
+    turns = take(words, bit + count + begin, size)
+    turn = turns >> max(size - 1, 0)
+    other = turns ^ ((1 << size) - 1) * turn
+    last = begin + highest_bit(other) if other != 0 else first
     begin = bit + (2 + has_flips) * count + 2 * strip * width
     c = take(words, begin + (t + 2) * width, width)
     near = take(words, begin + (t + 1) * width, width)
@@ -244,7 +231,7 @@ def weigh_packed_hits(
         directions: (r, 3) float32, not zero where there is a hit.
         at: (k,) int32, the rays that results are for; others are left alone.
         found_t: (k,) float32, t of each.
-        found: (k,) int32, the triangle in file order; negative on a miss.
+        found: (k,) int32, 256 times its block plus its number there; negative on a miss.
         headers: (b, 8) uint32.
         words: (w,) uint32.
         faces: (>= n,) int32, the reported face of each triangle; (0,) where triangles are faces.
@@ -264,21 +251,22 @@ def weigh_packed_hits(
     for k in range(len(at)):
         r = at[k]
         t[r] = found_t[k]
-        face[r] = found[k]
-        triangle[r] = found[k]
         if found[k] < 0:
+            face[r] = found[k]
+            triangle[r] = -1
             u[r] = 0.0
             v[r] = 0.0
-            triangle[r] = -1
             continue
-        if len(faces) > 0:
-            face[r] = faces[found[k]]
+        block = np.int64(found[k]) >> 8
+        place = np.int64(found[k]) & 255
+        number = np.int64(headers[block, 0]) + place
+        triangle[r] = number
+        face[r] = faces[number] if len(faces) > 0 else number
 
         # Decode the triangle, and turn it as the tests do.
-        block = block_of(headers, triangle[r])
         bit = np.int64(headers[block, 1]) << 5
         counts = block_counts(headers, block)
-        indices = corner_indices(words, bit, counts, np.int64(triangle[r]) - np.int64(headers[block, 0]))
+        indices = corner_indices(words, bit, counts, place)
         scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
         turn = first_corner(decoded)
         for j in range(3):
@@ -287,7 +275,7 @@ def weigh_packed_hits(
 
         # Weigh its corners, named as the reported face does.
         if len(rotations) > 0:
-            turn = (turn + rotations[triangle[r]]) % 3
+            turn = (turn + rotations[number]) % 3
         weigh_corners(origins, directions, r, scale, corners, turn, room, weights)
         u[r] = weights[1]
         v[r] = weights[2]

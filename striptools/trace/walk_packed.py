@@ -124,7 +124,6 @@ class PackedScene(NamedTuple):
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = lax.optimization_barrier(self._run_of(child))
         header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
-        first = header[0] + (run & 0xFF)
         lane = jnp.arange(LANES, dtype=jnp.uint32)
         corners = self._corners(header, run, options.decode.flips)
         x, y, z = self._positions(header, corners, options.decode)
@@ -132,41 +131,46 @@ class PackedScene(NamedTuple):
         ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
         t = crossing_of(edges_of(ax, ay, az, shear), turn)
         t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
-        triangle = (first + lane).astype(jnp.int32)
+        name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
         found = _any((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, triangle, options.any_hit), lambda: best)
+        return lax.cond(found, lambda: self._merged(best, t, name, options.any_hit), lambda: best)
 
-    def _merged(self, best: Best, t: Array, triangle: Array, any_hit: bool) -> Best:
+    def _merged(self, best: Best, t: Array, name: Array, any_hit: bool) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
         tied = (t > 0) & (t == best.t)
         if any_hit:
             tied = jnp.zeros_like(tied)
         elif self.has_faces:
-            mine, others = (lambda: self.faces_of(triangle)), (lambda: self.faces_of(best.name))
+            mine, others = (lambda: self.faces_of(name)), (lambda: self.faces_of(best.name))
             tied = lax.cond(_any(tied), lambda: tied & (mine() < others()), lambda: tied)
         else:
-            tied = tied & (triangle < best.name)
-        return replaced(best, (t > 0) & (t < best.t) | tied, t, triangle)
+            tied = tied & (name < best.name)
+        return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
 
     def faces_of(self, names: Array) -> Array:
         """The faces of triangles; a name that is none keeps its number."""
         if not self.has_faces:
             return names
-        return jnp.where(names < 0, names, _at(self.faces, index(names)))
+        block, place = index(names) >> 8, index(names) & 0xFF
+        first = _at(self.headers, (block, jnp.uint32(0)))
+        return jnp.where(names < 0, names, _at(self.faces, first + place))
 
     def _run_of(self, child: Array) -> tuple[Array, Array]:
         """The block of a leaf, and what is said of its run."""
         code = index(~child)
         node, slot = code >> 3, code & 7
-        record = lax.dynamic_slice(self.nodes, (node, jnp.uint32(0)), (1, 16))[0]
-        inner, below = record[3] >> 16 & 0xFF, (jnp.uint32(1) << slot) - 1
+        head, low_x, high_x = (
+            lax.dynamic_slice(self.nodes, (node, jnp.uint32(at)), (1, size))[0]
+            for at, size in ((0, 4), (4, 2), (10, 2))
+        )
+        inner, below = head[3] >> 16 & 0xFF, (jnp.uint32(1) << slot) - 1
         bits = 8 * (slot & 3)
         under = (jnp.uint32(1) << bits) - 1
-        first = _used_bytes(record[4], record[10]) & jnp.where(slot < 4, under, ALL)
-        second = _used_bytes(record[5], record[11]) & jnp.where(slot < 4, 0, under)
+        first = _used_bytes(low_x[0], high_x[0]) & jnp.where(slot < 4, under, ALL)
+        second = _used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
         rank = lax.population_count(first | second >> 1) - lax.population_count(inner & below)
-        block = record[1] & BLOCK_BITS
-        return block, _at(self.runs, _at(self.first_run, block) + (record[1] >> 24) + rank)
+        block = head[1] & BLOCK_BITS
+        return block, _at(self.runs, _at(self.first_run, block) + (head[1] >> 24) + rank)
 
     def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
@@ -314,7 +318,7 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
 
 def _any(flags: Array) -> Array:
     """Whether any lane's flag is set."""
-    return folded(jnp.where(flags, jnp.int32(1), jnp.int32(0)), jnp.bitwise_or) != 0
+    return jnp.sum(jnp.where(flags, jnp.int32(1), jnp.int32(0))) != 0
 
 
 def _number(a: Array) -> Array:
@@ -327,7 +331,7 @@ def _power_of_two(exponent: Array) -> Array:
     return lax.bitcast_convert_type((exponent + 127) << 23, jnp.float32)
 
 
-def _at(values: Array, places: Array) -> Array:
+def _at(values: Array, places: Any) -> Array:
     """Values at places that are known to be inside."""
     return values.at[places].get(mode="promise_in_bounds")
 
