@@ -92,16 +92,16 @@ class PackedScene(NamedTuple):
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         at = index(node)
         planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
-        planes = planes.astype(jnp.int32).astype(jnp.float32)
+        planes = planes.astype(jnp.int32)
         head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
         origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
         shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
         low, high = [], []
         for axis in range(3):
-            start = _number(origins[axis]) * slab.inverse[axis]
-            step = slab.inverse[axis] * _power_of_two(shifts[axis].astype(jnp.int32))
-            low.append(planes[axis] * step + (start - slab.low[axis]))
-            high.append(planes[axis + 3] * step + (start - slab.high[axis]))
+            origin, shift = origins[axis].astype(jnp.int32), shifts[axis].astype(jnp.int32)
+            near, far = ((origin + (planes[row] << shift)).astype(jnp.float32) for row in (axis, axis + 3))
+            low.append(near * slab.inverse[axis] - slab.low[axis])
+            high.append(far * slab.inverse[axis] - slab.high[axis])
         return passes(low, high, limit) & (planes[0] <= planes[3])
 
     def child_of(self, node: Array, lane: Array) -> Array:
