@@ -144,7 +144,6 @@ def with_runs(scene, **fields):
 
 
 FAULTS = {
-    "RDM107": lambda s: with_runs(s, runs=s.packed.runs | np.uint16(1 << 11)),
     "RDM201": lambda s: replace(s, source_face_count=s.triangle_count - 1),
     "RDM202": lambda s: replace(s, error_bound=float("nan")),
     "RDM203": lambda s: replace(s, grid_exponent=105),
@@ -158,12 +157,14 @@ FAULTS = {
     "RDM601": lambda s: with_blocks(s, headers=changed(s.blocks.headers, (1, 0), 0)),
     "RDM602": lambda s: with_blocks(s, headers=changed(s.blocks.headers, (1, 1), 0)),
     "RDM606": lambda s: with_blocks(s, words=s.blocks.words[:-16]),
-    "RDM701": lambda s: with_nodes(s, (0, 1), 1),
+    "RDM701": lambda s: with_nodes(s, (0, 1), s.packed.nodes[0, 1] + np.uint32(1)),
     "RDM705": lambda s: with_nodes(s, (0, 4), 0xFFFFFFFF),
     "RDM707": lambda s: with_nodes(s, (0, 2), 1),
+    "RDM709": lambda s: with_nodes(s, (0, 1), s.packed.nodes[0, 1] ^ np.uint32(1 << 31)),
     "RDM801": lambda s: with_runs(s, first_run=changed(s.packed.first_run, 0, 1)),
     "RDM802": lambda s: with_runs(s, longest_run=1),
     "RDM803": lambda s: with_runs(s, runs=changed(s.packed.runs, 0, s.packed.runs[1])),
+    "RDM804": lambda s: with_runs(s, runs=s.packed.runs ^ np.uint32(1 << 27)),
     "RDM901": lambda s: replace(s, metadata=[]),
     "RDM903": lambda s: replace(s, metadata={"unit": 3}),
 }

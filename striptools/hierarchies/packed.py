@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt16, UInt32
+from jaxtyping import Float32, Int32, UInt32
 
 from striptools.errors import UnreadableSceneError, UsageError
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree
@@ -51,7 +51,7 @@ __all__ = [
 NodeWords = UInt32[np.ndarray, "m 16"]
 SlotChildren = Int32[np.ndarray, "m 8"]
 FirstRuns = UInt32[np.ndarray, " b"]
-Runs = UInt16[np.ndarray, " r"]
+Runs = UInt32[np.ndarray, " r"]
 
 LONGEST_RUN = 8
 """The most triangles of a run: the lanes of a leaf test."""
@@ -101,7 +101,7 @@ class PackedNodes:
             then the others; only those over blocks where `runs` is None.
         top_count: How many are over blocks.
         first_run: (b,) uint32, where each block's runs begin; None where nodes are not complete.
-        runs: (r,) uint16, the runs of SPEC 4.5; None where nodes are not complete.
+        runs: (r,) uint32, the runs of SPEC 4.5; None where nodes are not complete.
         longest_run: The most triangles of a run; 0 where nodes are not complete.
     """
 
@@ -201,7 +201,8 @@ def build_inner(
 
     Returns:
         (k, 16) uint32 nodes: the roots of all blocks, then the others; (b,) uint32, where each block's runs
-        begin; and (r,) uint16 runs.
+        begin; and (r,) uint32 runs, of which bits 0 to 10 are there: `kernels.packed_hits.describe_runs`
+        writes the rest, which strips say.
 
     Raises:
         UsageError: `longest_run` is out of range.
@@ -216,7 +217,7 @@ def build_inner(
     def build(begin: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         end = min(begin + JOB, blocks)
         triangles = int(block_starts[end] - block_starts[begin])
-        words, runs = np.zeros((triangles + end - begin, 16), np.uint32), np.zeros(triangles, np.uint16)
+        words, runs = np.zeros((triangles + end - begin, 16), np.uint32), np.zeros(triangles, np.uint32)
         inner, found = kernels.build_blocks(
             *given, begin, end, *limits, *_room(), words, words.view(np.uint8), counts, runs
         )
@@ -312,6 +313,7 @@ def check_packed(
     _check_counts(packed, blocks, roots)
     slots = _slots(packed.nodes)
     _check_slots(packed.nodes, slots)
+    _check_marks(packed.nodes[: packed.top_count], slots.leaf[: packed.top_count])
     child = _check_links(packed, slots, blocks, roots)
     if packed.runs is None:
         first, count = block_starts[:-1].astype(np.int32), np.diff(block_starts).astype(np.int32)
@@ -371,6 +373,12 @@ def _check_slots(nodes: NodeWords, slots: _Slots) -> None:
     _require(not slots.empty.all(axis=1).any(), "a node has no child")
 
 
+def _check_marks(tops: NodeWords, leaf: np.ndarray) -> None:
+    """Each node over blocks says which of its slots are leaves."""
+    marks = np.packbits(leaf, axis=1, bitorder="little")[:, 0]
+    _require(np.array_equal(tops[:, 1] >> 24, marks), "a node over blocks has other leaves than it says")
+
+
 def _check_links(packed: PackedNodes, slots: _Slots, blocks: int, roots: Roots) -> SlotChildren:
     """Each node, block and run is reached once, from where it may be; gives the children of all slots."""
     top, nodes = packed.top_count, packed.nodes.astype(np.int64)
@@ -388,11 +396,11 @@ def _check_links(packed: PackedNodes, slots: _Slots, blocks: int, roots: Roots) 
     _require(np.array_equal(np.sort(of_top), below), "a top node has not one parent")
     first = top + blocks if complete else top
     _require(np.array_equal(np.sort(of_rest), np.arange(first, len(nodes))), "a node has not one parent")
-    _check_blocks(nodes[:top, 1:2] + ranks[:top], slots.leaf[:top], roots)
+    _check_blocks((nodes[:top, 1:2] & 0xFFFFFF) + ranks[:top], slots.leaf[:top], roots)
     child = np.where(slots.inner, target, EMPTY)
     if not complete:
-        return np.where(slots.leaf, -(nodes[:, 1:2] + ranks + 1), child).astype(np.int32)
-    child = np.where(slots.leaf & is_top, top + nodes[:, 1:2] + ranks, child)
+        return np.where(slots.leaf, -((nodes[:, 1:2] & 0xFFFFFF) + ranks + 1), child).astype(np.int32)
+    child = np.where(slots.leaf & is_top, top + (nodes[:, 1:2] & 0xFFFFFF) + ranks, child)
     run = _linked_runs(packed, slots, child, blocks)
     return np.where(slots.leaf & ~is_top, -(run + 1), child).astype(np.int32)
 
@@ -441,7 +449,6 @@ def _check_runs(packed: PackedNodes, block_starts: Counts, strip_starts: Counts)
     assert packed.runs is not None
     assert packed.first_run is not None
     first, count = run_ranges(packed, block_starts)
-    _require(not (packed.runs >> 11).any(), "reserved bits of a run are set")
     _require(int(count.max(initial=0)) <= packed.longest_run, "a run is too long")
     strip = np.searchsorted(strip_starts[:-1], first, side="right") - 1
     owner = np.searchsorted(packed.first_run, np.arange(len(first)), side="right") - 1

@@ -9,18 +9,6 @@ from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_cor
 
 
 @kernel
-def mark_leaves(words, records, top_count):
-    """Write to bits 24 to 31 of the word `leaves` of nodes over blocks which of their slots are leaves."""
-    for node in range(top_count):
-        leaves = np.int64(0)
-        for slot in range(WIDTH):
-            used = records[node, LOW + slot] <= records[node, LOW + 3 * WIDTH + slot]
-            if used and (records[node, 14] >> slot) & 1 == 0:
-                leaves |= np.int64(1) << slot
-        words[node, 1] |= leaves << 24
-
-
-@kernel
 def depth_of(words, records, top_count):
     """The most nodes on a way from the root down; children come after their parents."""
     count = len(words)
@@ -65,7 +53,7 @@ def least_exponent(headers, words):
 
 @kernel
 def describe_runs(headers, words, first_run, runs, begin, end, described):
-    """Say of each run of the blocks `begin:end` all that its triangles' places are found by.
+    """Say of each run of the blocks `begin:end` all that its triangles' places are found by: SPEC 4.5.
 
     In the order of a strip's vertices, newest behind, triangle j of a run whose first vertex is number p has
     vertex p + j + 2 for its newest corner and p + j + 1 for its near one; by its turn the near one is a or b.
@@ -76,7 +64,7 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
         headers: (b, 8) uint32.
         words: (w,) uint32.
         first_run: (b+1,) int64.
-        runs: (r,) uint16.
+        runs: (r,) uint32, of which bits 0 to 10 are read.
         begin: The first block.
         end: Where they end.
         described: (r,) uint32, written. Bits 0 to 7: the first triangle; 8 to 10: triangles, less one; 11

@@ -333,7 +333,7 @@ def build_blocks(
             one behind the roots.
         records: The same memory as (.., 64) uint8.
         run_counts: (b,) uint32, written for these blocks.
-        runs: (>= r,) uint16, written: the runs of these blocks.
+        runs: (>= r,) uint32, written: the runs of these blocks, bits 0 to 10 of them.
 
     Returns:
         How many nodes there are beside the roots, and how many runs.
@@ -420,10 +420,24 @@ def build_top(boxes, size, items, low, per_unit, words, records, order):
     one = np.float32(1.0)
     split, _, _ = cheapest_forests(boxes, size, 1, one, one, np.float32(0.0))
     stack = np.empty((len(items) + WIDTH, 3), np.int64)
-    return emit_nodes(
+    count = emit_nodes(
         boxes, size, split, items, low, per_unit, words, records, np.int64(0), np.int64(1), np.int64(0),
         np.int64(1), np.int64(0), order, stack, room_for_emission(),
     )  # fmt: skip
+    mark_leaves(words, records, count)
+    return count
+
+
+@kernel
+def mark_leaves(words, records, count):
+    """Write to bits 24 to 31 of the word `leaves` of nodes over blocks which of their slots are leaves."""
+    for node in range(count):
+        leaves = np.int64(0)
+        for slot in range(WIDTH):
+            used = records[node, LOW + slot] <= records[node, LOW + 3 * WIDTH + slot]
+            if used and (records[node, 14] >> slot) & 1 == 0:
+                leaves |= np.int64(1) << slot
+        words[node, 1] |= leaves << 24
 
 
 @kernel
@@ -438,9 +452,9 @@ def slot_children(words, top_count, first_run, child):
     """
     for node in range(len(words)):
         base = np.int64(words[node, 0]) & 0xFFFFFFF
-        leaf = np.int64(words[node, 1])
+        leaf = np.int64(words[node, 1]) & 0xFFFFFF
         if node >= top_count:
-            leaf = np.int64(first_run[leaf & 0xFFFFFF]) + (leaf >> 24)
+            leaf = np.int64(first_run[leaf]) + (np.int64(words[node, 1]) >> 24)
         inner = np.int64(words[node, 3]) >> 16 & 255
         for slot in range(WIDTH):
             below = np.int64(words[node, 4 + slot // 4]) >> 8 * (slot % 4) & 255

@@ -15,13 +15,14 @@ from jaxtyping import UInt32
 
 from striptools.errors import UsageError
 from striptools.kernels import blocks as kernels
+from striptools.kernels.packed_hits import describe_runs
 from striptools.reducem.issues import unreadable
 from striptools.reducem.layout import ZERO_WORDS
 from striptools.strips.topology import Strips
 from striptools.threads import in_chunks
 from striptools.types import Bools, Counts, Positions, Words
 
-__all__ = ["Blocks", "Decoded", "decode_blocks", "encode_blocks"]
+__all__ = ["Blocks", "Decoded", "decode_blocks", "described_runs", "encode_blocks"]
 
 Headers = UInt32[np.ndarray, "b 8"]
 
@@ -192,6 +193,25 @@ def decode_blocks(blocks: Blocks, threads: int = 1, where: str = "scene") -> Dec
     return Decoded(
         positions, vertex_starts, vertices, turns, flips if has_flips else None, starts, block_starts
     )
+
+
+def described_runs(blocks: Blocks, first_run: np.ndarray, runs: np.ndarray, threads: int = 1) -> np.ndarray:
+    """Say of runs where in their strips their triangles lie: SPEC 4.5.
+
+    Args:
+        blocks: Whose rules are kept.
+        first_run: (b,) uint32, where each block's runs begin.
+        runs: (r,) uint32, whose bits 0 to 10 are read.
+        threads: How many threads share the blocks.
+
+    Returns:
+        (r,) uint32, all bits of them.
+    """
+    described = np.zeros(len(runs), np.uint32)
+    starts = np.append(first_run, len(runs)).astype(np.int64)
+    given = (blocks.headers, blocks.words, starts, runs)
+    in_chunks(lambda part: describe_runs(*given, *part, described), blocks.count, threads, SMALLEST_CHUNK)
+    return described
 
 
 def check_headers(blocks: Blocks, triangle_count: int, where: str = "scene") -> None:

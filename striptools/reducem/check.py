@@ -11,7 +11,7 @@ from striptools.kernels import scene as kernels
 from striptools.mesh.attributes import Domain
 from striptools.reducem import layout
 from striptools.reducem.attributes import check_columns
-from striptools.reducem.blocks import check_headers
+from striptools.reducem.blocks import check_headers, described_runs
 from striptools.reducem.geometries import check_faces, check_geometries, check_instance_rules
 from striptools.reducem.issues import unreadable
 from striptools.reducem.scene import Remap, Scene, bounds_of
@@ -32,6 +32,7 @@ _NODE_CODES = {
     "a node without inner children has a base": "RDM706",
     "a node without leaves has leaves": "RDM706",
     "a node has no child": "RDM708",
+    "a node over blocks has other leaves than it says": "RDM709",
     "a child is none of the nodes that it may be": "RDM701",
     "a top node has not one parent": "RDM702",
     "a node has not one parent": "RDM702",
@@ -40,7 +41,6 @@ _NODE_CODES = {
     "a node has a run of another block": "RDM704",
     "a run has not one parent": "RDM704",
     "the runs of blocks do not follow each other": "RDM801",
-    "reserved bits of a run are set": "RDM107",
     "a run is too long": "RDM802",
     "a run goes on in another strip": "RDM802",
     "the runs do not hold every triangle once": "RDM803",
@@ -164,6 +164,11 @@ def check_nodes(scene: Scene, where: str) -> None:
         if code is None:
             raise
         raise unreadable(code, f"{where}: {'RUNS' if code[3] == '8' else 'NODE'}") from error
+    packed = scene.packed
+    if packed.runs is not None and packed.first_run is not None:
+        wrong = np.flatnonzero(packed.runs != described_runs(scene.blocks, packed.first_run, packed.runs))
+        if len(wrong):
+            raise unreadable("RDM804", f"{where}: RUNS: run {wrong[0]} of all")
 
 
 def check_remap(remap: Remap | None, triangle_count: int, source_face_count: int, where: str) -> None:
@@ -205,7 +210,7 @@ def _check_dtypes(scene: Scene) -> None:
         ("blocks.words", scene.blocks.words, np.uint32),
         ("packed.nodes", scene.packed.nodes, np.uint32),
         ("packed.first_run", scene.packed.first_run, np.uint32),
-        ("packed.runs", scene.packed.runs, np.uint16),
+        ("packed.runs", scene.packed.runs, np.uint32),
         ("low", scene.low, np.float32),
         ("high", scene.high, np.float32),
         ("origin", scene.origin, np.float64),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-VERSION = (0, 3)
+VERSION = (0, 4)
 ALIGNMENT = 64
 SECTION_LIMIT = 64
 MUST_UNDERSTAND = 1
@@ -228,7 +228,7 @@ SECTIONS = (
 RAW = (SCENE, INSTANCES)
 """Those that must not be packed: what bounds the length of others, and what no count bounds."""
 
-PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 2, REMAP.kind: 4}
+PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 4, REMAP.kind: 4}
 """Bytes of a record for the kinds of sections that may have the codec of planes."""
 
 
@@ -283,6 +283,6 @@ def section_lengths(
         SCENE.kind: SCENE_RECORD.size,
         BLOCK_HEADERS.kind: BLOCK_HEADER.size * blocks,
         NODES.kind: NODE_RECORD.size * nodes,
-        RUNS.kind: 4 * blocks + 2 * runs if boxes_stored else 0,
+        RUNS.kind: aligned(4 * blocks) + 4 * runs if boxes_stored else 0,
         REMAP.kind: remap_length(triangles),
     }

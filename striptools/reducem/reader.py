@@ -295,10 +295,13 @@ class _File:
         nodes = self.section(layout.NODES, layout.NODE_RECORD.size * record["node_count"])
         blocks, run_count = record["block_count"], record["run_count"]
         stored = bool(record["flags"] & layout.BOXES_STORED)
-        rest = self.section(layout.RUNS, 4 * blocks + 2 * run_count if stored else 0)
+        begin = layout.aligned(4 * blocks)
+        rest = self.section(layout.RUNS, begin + 4 * run_count if stored else 0)
+        if rest[4 * blocks : begin].any():
+            raise unreadable("RDM108", f"{self.where}: RUNS")
         if stored:
             first_run = _array(rest[: 4 * blocks], "<u4", np.uint32)
-            runs = _array(rest[4 * blocks :], "<u2", np.uint16)
+            runs = _array(rest[begin:], "<u4", np.uint32)
         words = _array(nodes, "<u4", np.uint32).reshape(-1, 16)
         packed = PackedNodes(words, record["top_count"], first_run, runs, record["longest_run"])
         scene.__dict__["packed"] = packed

@@ -17,7 +17,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.mesh.recentre import Origin
 from striptools.partition.boxes import face_boxes
 from striptools.reducem.attributes import Column, columns_of
-from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, encode_blocks
+from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, described_runs, encode_blocks
 from striptools.reducem.geometries import SceneGeometries, SceneInstances, roots_of
 from striptools.reducem.layout import LONGEST_RUN
 from striptools.strips.topology import Strips, decode_strips
@@ -374,18 +374,13 @@ class Scene:
     def resident_bytes_per_triangle(self) -> float:
         """Say what tracing without unpacking holds, over the triangles.
 
-        That is the blocks and the complete hierarchy as a file with boxes stored has them, but for runs, of
-        which a tracer keeps a word each; neither the remap nor the few per cent by which it rounds arrays up.
+        That is the blocks and the complete hierarchy as a file with boxes stored has them; neither the remap
+        nor the few per cent by which a tracer rounds arrays up that no file holds.
         """
         packed = self.with_boxes()
-        held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run]
-        runs = 0 if packed.runs is None else RUN_WORD * len(packed.runs)
-        held_bytes = sum(array.nbytes for array in held if array is not None)
-        return (held_bytes + runs) / max(1, self.triangle_count)
+        held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run, packed.runs]
+        return sum(array.nbytes for array in held if array is not None) / max(1, self.triangle_count)
 
-
-RUN_WORD = 4
-"""Bytes of what a tracer keeps of a run: two more than the file, so that no bit has to be searched for."""
 
 _FIELDS = frozenset(f.name for f in fields(Scene))
 
@@ -492,4 +487,5 @@ def _completed(scene: Scene, threads: int) -> PackedNodes:
     given = (scene.triangle_boxes(threads), scene.block_starts, scene.starts, scene.grid)
     top = scene.packed.top_count
     nodes, first_run, runs = build_inner(*given, top, LONGEST_RUN, threads)
+    runs = described_runs(scene.blocks, first_run, runs, threads)
     return PackedNodes(np.concatenate([scene.packed.nodes, nodes]), top, first_run, runs, LONGEST_RUN)

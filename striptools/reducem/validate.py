@@ -30,7 +30,7 @@ _NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
 _PASSED_OVER = ("RMAP", "ATTR", "MATL", "META")
 _KNOWN = (*_NEEDED, *_PASSED_OVER)
 _OPTIONAL = (*_PASSED_OVER, "GEOM", "INST")
-_WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 2, "RMAP": 4}
+_WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4}
 """Bytes of a record for the kinds that may have codec 3."""
 _MOST_METADATA = 2**20
 _MOST_MATERIALS = 2**22
@@ -78,7 +78,7 @@ def _header(inspection: Inspection) -> bool:
         inspection.found("RDM101", "", len(data))
         return False
     major, minor, count, total, reserved, checksum = struct.unpack_from("<HHIQII", data, 8)
-    if (major, minor) != (0, 3):
+    if (major, minor) != (0, 4):
         inspection.found("RDM103", f"version {major}.{minor}", 8)
         return False
     if total != len(data) or total % 64:
@@ -212,7 +212,7 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
 
 def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str, tuple[int, int]]:
     """The least and the most bytes of each section by the counts; (0, 0) where it must not be there."""
-    runs, remap = (4 * b + 2 * r) * stored, 4 * n + -(-n // 4)
+    runs, remap = (-(-b // 16) * 64 + 4 * r) * stored, 4 * n + -(-n // 4)
     lengths = {"BLKH": (32 * b, 32 * b), "BLKD": (64, 3936 * b + 128) if b else (0, 0)}
     lengths |= {"NODE": (64 * m, 64 * m), "RUNS": (runs, runs)}
     lengths |= {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}

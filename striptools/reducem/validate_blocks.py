@@ -33,12 +33,14 @@ class Geometry:
     Attributes:
         starts: (b + 1,) int64, the first triangle of each block, and n.
         begins: (n,) bool, whether a strip begins at each triangle.
+        turns: (n,) bool, the turn bit of each triangle.
         low: (n, 3) float32, the least coordinates of each triangle.
         high: (n, 3) float32, the largest.
     """
 
     starts: np.ndarray
     begins: np.ndarray
+    turns: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
@@ -90,11 +92,13 @@ def inspect_blocks(inspection: Inspection) -> Geometry | None:
     sound = [part for part in parts if part is not None]
     if not blocks.whole.all() or len(sound) < len(parts):
         return None
-    begins, low, high, lowest, highest = (np.concatenate(column) for column in zip(*sound, strict=True))
+    begins, turns, low, high, lowest, highest = (
+        np.concatenate(column) for column in zip(*sound, strict=True)
+    )
     _bounds(inspection, lowest, highest)
     if not counted:
         return None
-    return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, low, high)
+    return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, turns, low, high)
 
 
 def inspect_headers(inspection: Inspection, headers: Section, data: Section) -> Blocks:
@@ -191,7 +195,7 @@ def _rows(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Look at some blocks; gives strip begins, triangle bounds, and bounds over all, where they are sound."""
+    """Look at some blocks; gives strip begins, turns, triangle bounds, and bounds over all, where they are sound."""
     strips = _strips(inspection, blocks, chunk)
     index = _indices(inspection, blocks, chunk)
     vertices = _vertices(inspection, blocks, chunk)
@@ -209,7 +213,7 @@ def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[
     offsets = (np.cumsum(blocks.q[chunk]) - blocks.q[chunk])[row]
     positions = [vertices[corner + offsets] for corner in corners]
     low, high = np.minimum.reduce(positions), np.maximum.reduce(positions)
-    return strips[0], low, high, vertices.min(axis=0)[None], vertices.max(axis=0)[None]
+    return *strips, low, high, vertices.min(axis=0)[None], vertices.max(axis=0)[None]
 
 
 def _strips(

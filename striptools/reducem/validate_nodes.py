@@ -90,7 +90,10 @@ def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) 
     section = inspection.sections["RUNS"]
     b = len(geometry.starts) - 1
     starts = np.append(np.frombuffer(section.data, "<u4", b).astype(np.int64), count)
-    words = np.frombuffer(section.data, "<u2", count, 4 * b).astype(np.int64)
+    begin = -(-b // 16) * 64
+    words = np.frombuffer(section.data, "<u4", count, begin).astype(np.int64)
+    if any(section.data[4 * b : begin]):
+        inspection.found("RDM108", "RUNS", section.at(4 * b))
     falls = np.diff(starts) < 0
     falls[0] |= starts[0] != 0
     if inspection.found_where("RDM801", falls, lambda i: f"RUNS: block {i}", lambda i: section.at(4 * i)):
@@ -104,24 +107,40 @@ def _runs(inspection: Inspection, geometry: Geometry, count: int, longest: int) 
             code,
             wrong,
             lambda i: f"RUNS: block {block[i]}, run {i - starts[block[i]]}",
-            lambda i: section.at(4 * b + 2 * i),
+            lambda i: section.at(begin + 4 * i),
         )
 
-    check("RDM107", words >> 11 != 0)
     outside = first + length > geometry.starts[block + 1]
     # A strip begins inside the run if more of them have begun by its last triangle than by its first.
     begun = np.cumsum(geometry.begins)
     last = np.minimum(first + length, geometry.starts[block + 1]) - 1
     over = begun[last] != begun[np.minimum(first, len(begun) - 1)]
     check("RDM802", outside | over | (length > longest))
+    inside = np.flatnonzero(~outside)
+    described = np.zeros(count, np.int64)
+    described[inside] = _described(geometry, block[inside], first[inside], length[inside])
+    check("RDM804", ~outside & (words >> 11 != described))
     if outside.any():
         return _Runs(starts, block, first, length, whole=False)
     triangles = np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
     times = np.bincount(triangles, minlength=len(begun))
     wrong = inspection.found_where(
-        "RDM803", times != 1, lambda t: f"RUNS: triangle {t}", lambda t: section.at(4 * b)
+        "RDM803", times != 1, lambda t: f"RUNS: triangle {t}", lambda t: section.at(begin)
     )
     return _Runs(starts, block, first, length, whole=not wrong)
+
+
+def _described(geometry: Geometry, block: np.ndarray, first: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """What runs must say beside their triangles: their strips, turns and equal triangles before them."""
+    turns = geometry.turns | geometry.begins
+    number = np.arange(len(turns))
+    changed = geometry.begins | (turns != np.roll(turns, 1))
+    equal = number - np.maximum.accumulate(np.where(changed, number, 0))
+    begun = np.cumsum(geometry.begins)
+    described = begun[first] - begun[geometry.starts[block]] | equal[first] + 1 << 16
+    for j in range(8):
+        described |= (turns[np.minimum(first + j, len(turns) - 1)] & (j < length)).astype(np.int64) << 8 + j
+    return described
 
 
 def _slots(inspection: Inspection, top: int, blocks: int, parts: Parts) -> _Nodes:
@@ -141,8 +160,11 @@ def _slots(inspection: Inspection, top: int, blocks: int, parts: Parts) -> _Node
     check("RDM706", (base > 0) & ~is_inner.any(axis=1), 0)
     check("RDM706", (leaves > 0) & ~is_leaf.any(axis=1), 4)
     check("RDM708", is_empty.all(axis=1), 14)
+    is_top = np.arange(len(rows)) < top
+    marks = is_leaf @ (1 << np.arange(8))
+    check("RDM709", is_top & is_leaf.any(axis=1) & (leaves >> 24 != marks), 7)
     child = base[:, None] + np.cumsum(is_inner, axis=1) - 1
-    first = np.where(np.arange(len(rows)) < top, leaves, leaves >> 24)
+    first = np.where(is_top, leaves & 2**24 - 1, leaves >> 24)
     leaf = first[:, None] + np.cumsum(is_leaf, axis=1) - 1
     return _Nodes(section, rows, top, blocks, parts, is_inner, is_leaf, ~is_empty & ~inverted, child, leaf)
 

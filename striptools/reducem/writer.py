@@ -12,6 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from striptools.hierarchies.packed import PackedNodes
 from striptools.mesh.atomic import write_atomically, write_stream
 from striptools.reducem import layout
 from striptools.reducem.archive import packed, packed_blocks
@@ -123,15 +124,12 @@ def _chunks(sections: list[_Stored]) -> Iterator[Payload]:
 
 def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
     packed = scene.packed
-    runs = (
-        b"" if packed.runs is None else _view(packed.first_run, "<u4").tobytes() + _view(packed.runs, "<u2")
-    )
     return [
         (layout.SCENE, _scene_record(scene)),
         (layout.BLOCK_HEADERS, _view(scene.blocks.headers, "<u4")),
         (layout.BLOCK_DATA, _view(scene.blocks.words, "<u4")),
         (layout.NODES, _view(packed.nodes, "<u4")),
-        (layout.RUNS, runs),
+        (layout.RUNS, _runs(packed)),
         (layout.REMAP, _remap(scene.remap)),
         (layout.ATTRIBUTES, encode_columns(scene.columns)),
         (layout.MATERIALS, encode_materials(scene.materials)),
@@ -139,6 +137,13 @@ def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
         (layout.GEOMETRIES, encode_geometries(scene.geometries)),
         (layout.INSTANCES, encode_instances(scene.instances)),
     ]
+
+
+def _runs(packed: PackedNodes) -> Payload:
+    if packed.runs is None:
+        return b""
+    first_run = _view(packed.first_run, "<u4").tobytes()
+    return first_run + bytes(-len(first_run) % layout.ALIGNMENT) + _view(packed.runs, "<u4").tobytes()
 
 
 def _stored(scene: Scene, section: layout.Section, payload: Payload, archive: bool) -> _Stored:

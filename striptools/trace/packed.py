@@ -1,23 +1,20 @@
 """A scene laid out for the walk as it lies in its file: packed blocks, quantised nodes, runs."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from striptools.hierarchies.packed import BoxGrid, PackedNodes
+from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
-from striptools.threads import in_chunks
 from striptools.trace.leaves import Found, Rays, aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
-from striptools.trace.walk_packed import MARGIN, SLACK_WORDS, PackedScene
+from striptools.trace.walk_packed import MARGIN, PackedScene
 
 if TYPE_CHECKING:
     from striptools.reducem.blocks import Blocks
     from striptools.reducem.scene import Scene
-
-SMALLEST = 64
-"""Blocks below which another thread is not worth its start."""
 
 STEPS = 16
 """Size classes to each doubling: 4 % of memory at most for programs that scenes share."""
@@ -82,43 +79,33 @@ class PackedLayout:
 
 
 def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
-    """Lay a scene out for the walk through its blocks; nodes that the file does not hold are built."""
+    """Lay a scene out for the walk through its blocks; nodes that the file does not hold are built.
+
+    Arrays of a scene that holds its boxes are taken as they lie, in a mapped file too; others are copied to a
+    size class, so that scenes of like size share a program.
+    """
     packed, blocks = scene.with_boxes(threads), scene.blocks
     assert packed.first_run is not None
     assert packed.runs is not None
-    nodes = _padded(packed.nodes, len(packed.nodes) + 1)
-    planes = nodes.view(np.uint8)
-    kernels.mark_leaves(nodes, planes, packed.top_count)
-    described = _described(packed, blocks, threads)
+    laid: Callable[[np.ndarray], np.ndarray] = _padded if scene.packed.runs is None else np.asarray
     scale = scale_of(scene)
     exponent = int(np.frexp(scale)[1]) - 1
-    faces, rotations = _names(scene)
+    faces, rotations = _names(scene, laid)
+    nodes = laid(packed.nodes)
     arrays = PackedScene(
         nodes,
-        planes,
-        _padded(blocks.headers, blocks.count),
-        _padded(blocks.words, len(blocks.words) + SLACK_WORDS),
-        _padded(packed.first_run, blocks.count),
-        _padded(described, len(described)),
+        nodes.view(np.uint8),
+        laid(blocks.headers),
+        laid(blocks.words),
+        laid(packed.first_run),
+        laid(packed.runs),
         faces,
         np.uint32(packed.top_count),
         np.int32(exponent),
         _frame(scene, scale, exponent),
     )
-    count = len(packed.nodes)
-    depth = int(kernels.depth_of(nodes[:count], planes[:count], packed.top_count))
+    depth = int(kernels.depth_of(packed.nodes, packed.nodes.view(np.uint8), packed.top_count))
     return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks, exponent), depth)
-
-
-def _described(packed: PackedNodes, blocks: "Blocks", threads: int) -> np.ndarray:
-    """(r,) uint32: what the walk is told of each run."""
-    assert packed.first_run is not None
-    assert packed.runs is not None
-    described = np.zeros(len(packed.runs), np.uint32)
-    starts = np.append(packed.first_run, len(packed.runs)).astype(np.int64)
-    given = (blocks.headers, blocks.words, starts, packed.runs)
-    in_chunks(lambda part: kernels.describe_runs(*given, *part, described), blocks.count, threads, SMALLEST)
-    return described
 
 
 def decode_of(blocks: "Blocks", scale_exponent: int) -> Decode:
@@ -153,18 +140,18 @@ def _frame(scene: "Scene", scale: np.float32, exponent: int) -> Frame:
     return Frame(scale, reach_of(scene, scale), low, unit.astype(np.float32), MARGIN)
 
 
-def _names(scene: "Scene") -> tuple[np.ndarray, np.ndarray]:
+def _names(scene: "Scene", laid: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The face that a hit on each triangle is reported as, and how its corners are turned; or nothing."""
     if scene.remap is None:
         return np.zeros(0, np.int32), np.zeros(0, np.uint8)
-    return _padded(scene.remap.face, len(scene.remap.face)), scene.remap.rotation
+    return laid(scene.remap.face), scene.remap.rotation
 
 
-def _padded(values: np.ndarray, count: int) -> np.ndarray:
+def _padded(values: np.ndarray) -> np.ndarray:
     """A copy with zeros behind it up to a size class, from a cache line on."""
-    padded = aligned_zeros((size_class(count, STEPS), *values.shape[1:]), values.dtype.type)
+    padded = aligned_zeros((size_class(len(values), STEPS), *values.shape[1:]), values.dtype.type)
     padded[: len(values)] = values
     return padded
 
 
-__all__ = ["PackedLayout", "PackedNodes", "decode_of", "lay_out_packed"]
+__all__ = ["PackedLayout", "decode_of", "lay_out_packed"]

@@ -86,7 +86,7 @@ class WalkScene(Protocol):
 
     @property
     def node_count(self) -> int:
-        """Nodes; the last one is none."""
+        """Nodes, at least."""
         ...
 
     @property
@@ -103,7 +103,10 @@ class WalkScene(Protocol):
         ...
 
     def child_of(self, node: Array, lane: Array) -> Array:
-        """The child in a lane: a node, or a negative number other than `DONE` that names a leaf."""
+        """The child in a lane: a node, or a negative number other than `DONE` that names a leaf.
+
+        `DONE` for the last node and a lane above 7, which are at the bottom of each stack.
+        """
         ...
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: "WalkOptions") -> Best:
@@ -246,7 +249,7 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     rows = ready.reshape(len(ready) // options.interleave, options.interleave, -1)
     end = scene.node_count - 1
 
-    # The bottom of a stack is a node whose every child is DONE.
+    # The bottom of a stack has a lane that no node has.
     floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
     stacks = (floor,) * options.interleave
 

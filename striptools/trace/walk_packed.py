@@ -7,9 +7,8 @@ same corners, scaled by the same power of two, in the same test.
 
 Differences:
 
-1. A leaf is named by its node and slot, and its run is counted when it is visited. A run is a word of 4
-   bytes (`kernels.packed_hits.describe_runs`) in the place of the file's 2: beside its triangles it says
-   where their corners are in the strip, which saves reading start and turn bits.
+1. A leaf is named by its node and slot, and its run is counted when it is visited. The run says where its
+   triangles' corners are in the strip, which saves reading start and turn bits.
 2. What no block of the scene needs is not compiled in (`walk.Decode`).
 3. Corners are not put in the canonical order; only the sums are made in it (`triangle.crossing_of`).
 4. Lanes hold triangles, not faces: the remap is read where two hits have the same t, and nowhere else.
@@ -36,7 +35,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
-from striptools.trace.numerics import folded, index
+from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
 from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
 
@@ -47,20 +46,19 @@ LANES = 8
 BLOCK_BITS = 0xFFFFFF
 ALL = np.uint32(0xFFFFFFFF)
 SLACK_WORDS = 16
-"""Words behind the stream that a load may touch."""
+"""Words behind the stream that a load may touch: zeros of the file."""
 
 
 class PackedScene(NamedTuple):
-    """The sections of a scene file as arrays on a device, padded so that scenes of like size share a program.
+    """The sections of a scene file as arrays on a device.
 
     Attributes:
-        nodes: (m, 16) uint32, SPEC 4.4, but that bits 24 to 31 of the word `leaves` of a node over blocks say
-            which slots are leaves. The last node is none.
+        nodes: (m, 16) uint32, SPEC 4.4.
         planes: (m, 64) uint8, the same memory.
         headers: (b, 8) uint32, SPEC 4.2.
         words: (w,) uint32, the streams, `SLACK_WORDS` and more behind them.
         first_run: (b,) uint32.
-        runs: (r,) uint32, as `kernels.packed_hits.describe_runs` has them.
+        runs: (r,) uint32, SPEC 4.5.
         faces: (n,) int32, the reported face of each triangle in file order; (0,) where they are their own.
         top_count: () uint32, nodes over blocks.
         scale_exponent: () int32, of the frame's scale.
@@ -80,7 +78,7 @@ class PackedScene(NamedTuple):
 
     @property
     def node_count(self) -> int:
-        """Nodes and those that fill up the size class."""
+        """Nodes, and those that fill up a size class."""
         return len(self.nodes)
 
     @property
@@ -116,7 +114,7 @@ class PackedScene(NamedTuple):
         child = jnp.where(index(node) < self.top_count, as_block, as_run)
         child = jnp.where((inner & bit) != 0, as_node, child).astype(jnp.int32)
         # The bottom of a stack has a lane that no node has.
-        return jnp.where(_at_bottom(node, self.node_count), DONE, child)
+        return jnp.where(lane > 7, DONE, child)
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""
@@ -348,11 +346,6 @@ def _used_bytes(low: Array, high: Array) -> Array:
     """The top bit of each byte but of those where low is 1 and high is 0: four slots that are not empty."""
     other = (low ^ 0x01010101) | high
     return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & jnp.uint32(0x80808080)
-
-
-def _at_bottom(node: Array, count: int) -> Array:
-    """Whether a node is the one that lies at the bottom of each stack."""
-    return index(node) == count - 1
 
 
 # Notes

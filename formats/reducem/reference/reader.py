@@ -1,4 +1,4 @@
-"""Read a ReduceM scene file, format 0.3: the reference reader, written from SPEC.md alone.
+"""Read a ReduceM scene file, format 0.4: the reference reader, written from SPEC.md alone.
 
 It is slow and plain on purpose, needs nothing but the standard library and shares no code with striptools.
 Every refusal is a `RefusedError` that names the clause of SPEC.md. It reads raw sections; where an archive
@@ -55,6 +55,7 @@ class Scene:
         faces: The triangles in the order of the file, each three numbers of `vertices`.
         block_starts: The first triangle of each block, and n.
         begins: For each triangle 1 where a strip begins, else 0.
+        turns: For each triangle its turn bit.
         remap: `(face, rotation)` of each triangle, or None.
         nodes: The nodes in their order.
         runs: For each block its runs `(first triangle, triangles)`; None where boxes are not stored.
@@ -74,6 +75,7 @@ class Scene:
     faces: list = field(default_factory=list)
     block_starts: list = field(default_factory=lambda: [0])
     begins: list = field(default_factory=list)
+    turns: list = field(default_factory=list)
     remap: list | None = None
     nodes: list = field(default_factory=list)
     runs: list | None = None
@@ -157,8 +159,8 @@ def read_header(data):
     if len(data) < 32:
         raise RefusedError("3.1", "the file ends inside its header")
     major, minor, count, total, reserved, checksum = struct.unpack_from("<HHIQII", data, 8)
-    if (major, minor) != (0, 3):
-        raise RefusedError("7", f"version {major}.{minor} is not 0.3")
+    if (major, minor) != (0, 4):
+        raise RefusedError("7", f"version {major}.{minor} is not 0.4")
     if total != len(data) or total % 64:
         raise RefusedError("3.1", f"the file has {len(data)} bytes, not the {total} of its header")
     if not 1 <= count <= 64 or 32 + 40 * count > len(data):
@@ -261,7 +263,12 @@ def check_empty(record, payload):
 def check_lengths(record, sections):
     """Refuse sections that are missing, not needed, or of another length than the counts give."""
     n, b, m, r = (record[name] for name in ("triangle_count", "block_count", "node_count", "run_count"))
-    lengths = {"SCEN": 96, "BLKH": 32 * b, "NODE": 64 * m, "RUNS": 4 * b + 2 * r if record["stored"] else 0}
+    lengths = {
+        "SCEN": 96,
+        "BLKH": 32 * b,
+        "NODE": 64 * m,
+        "RUNS": align(4 * b) + 4 * r if record["stored"] else 0,
+    }
     if "RMAP" in sections:
         lengths["RMAP"] = 4 * n + -(-n // 4)
     for kind, length in lengths.items():
@@ -319,6 +326,7 @@ def read_block(scene, header, data, word):
     index = [stream >> p + i * w & (1 << w) - 1 for i in range(c)]
     check_indices(index, q)
     scene.begins += starts
+    scene.turns += turns
     first = len(scene.vertices)
     scene.vertices += read_vertices(stream >> p + c * w, q, axes)
     scene.faces += [[first + corner for corner in face] for face in read_faces(starts, turns, flips, index)]
@@ -437,16 +445,18 @@ def read_runs(scene, payload):
     """For each block its runs `(first triangle, triangles)`."""
     b, r = scene.record["block_count"], scene.record["run_count"]
     starts = [*struct.unpack_from(f"<{b}I", payload), r]
-    words = struct.unpack_from(f"<{r}H", payload, 4 * b)
+    words = struct.unpack_from(f"<{r}I", payload, align(4 * b))
+    if any(payload[4 * b : align(4 * b)]):
+        raise RefusedError("4.5", "unused bytes between the numbers of runs and the runs are not zero")
     if starts[0] != 0 or any(starts[i] > starts[i + 1] for i in range(b)):
         raise RefusedError("4.5", "the runs of the blocks are not in their order")
     runs = []
     for i in range(b):
         here = words[starts[i] : starts[i + 1]]
-        if any(word >> 11 for word in here):
-            raise RefusedError("4.5", "a reserved bit of a run is not zero")
-        runs.append([(word & 255, (word >> 8) + 1) for word in here])
+        runs.append([(word & 255, (word >> 8 & 7) + 1) for word in here])
         check_runs(scene, i, runs[-1])
+        if any(word != run_word(scene, i, *run) for word, run in zip(here, runs[-1], strict=True)):
+            raise RefusedError("4.5", f"block {i}: a run does not say where its corners are")
     return runs
 
 
@@ -462,6 +472,17 @@ def check_runs(scene, block, runs):
         raise RefusedError("4.5", f"block {block}: a run is in two strips")
 
 
+def run_word(scene, block, first, count):
+    """What RUNS must have of a run that lies in its strip; a strip's first triangle has turn 1."""
+    at = scene.block_starts[block] + first
+    turns = [turn | begin for turn, begin in zip(scene.turns, scene.begins, strict=True)]
+    equal = 0
+    while not scene.begins[at - equal] and turns[at - equal - 1] == turns[at]:
+        equal += 1
+    word = first | count - 1 << 8 | sum(scene.begins[at - first : at + 1]) - 1 << 11 | equal + 1 << 27
+    return word | sum(turns[at + j] << 19 + j for j in range(count))
+
+
 def read_node(scene, number, payload):
     """Node `number`: what its slots name, and their boxes."""
     base, leaves, *origin, inner, shifts = struct.unpack_from("<II3HBB", payload, 64 * number)
@@ -469,6 +490,8 @@ def read_node(scene, number, payload):
     shift = (base >> 28, shifts & 15, shifts >> 4)
     base &= 2**28 - 1
     is_top = number < scene.record["top_count"]
+    marks = leaves >> 24
+    leaves = leaves & 2**24 - 1 if is_top else leaves
     node = Node([], [])
     inners = leaf = 0
     for slot in range(8):
@@ -490,6 +513,9 @@ def read_node(scene, number, payload):
         node.boxes.append(
             [(origin[x] + (low[x] << shift[x]), origin[x] + (high[x] << shift[x])) for x in range(3)]
         )
+    wanted = sum((child[0] == "block") << i for i, child in enumerate(node.children))
+    if is_top and marks != wanted:
+        raise RefusedError("4.4", f"node {number}: says other leaves than it has")
     if (base and not inners) or (leaves and not leaf) or inners + leaf == 0:
         raise RefusedError("4.4", f"node {number}: base or leaves without such a child, or no child at all")
     return node

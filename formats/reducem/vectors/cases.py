@@ -562,6 +562,11 @@ def wrong(about: str, codes: str, plan: Plan, **changes) -> tuple[str, list[str]
     return about, codes.split(), encode(replace(plan, **changes))
 
 
+def flipped(bit: int) -> Callable[[bytes], bytes]:
+    """A change of one bit."""
+    return lambda data: patched(bit // 8, "B", data[bit // 8] ^ 1 << bit % 8)(data)
+
+
 def patched(at: int, fmt: str, *values: int) -> Callable[[bytes], bytes]:
     """A change of the bytes from `at` on; a negative place counts from the end."""
 
@@ -601,8 +606,8 @@ def _headers() -> dict[str, tuple[str, list[str], bytes]]:
         "magic_text_mode": ("line ends changed on the way", ["RDM102"], text),
         "other_file": ("a file of another kind", ["RDM102"], b"ply\nformat ascii 1.0\nend_header\n"),
         "major_1": wrong("a version to come", "RDM103", ONE, header={"major": 1}),
-        "minor_4": wrong("a version to come", "RDM103", ONE, header={"minor": 4}),
-        "minor_2": wrong("a version gone", "RDM103", ONE, header={"minor": 2}),
+        "minor_5": wrong("a version to come", "RDM103", ONE, header={"minor": 5}),
+        "minor_3": wrong("a version gone", "RDM103", ONE, header={"minor": 3}),
         "no_sections": wrong("no sections", "RDM105", ONE, header={"section_count": 0}),
         "sections_65": wrong(
             "one section too many", "RDM105", ONE, extra=[(f"X{i:03}", 0, 0, b"x") for i in range(62)]
@@ -970,6 +975,18 @@ def _nodes() -> dict[str, tuple[str, list[str], bytes]]:
         "node_without": of(
             "a node without a child", "RDM708", three, Node([leaf, leaf, leaf, inner], base=1), Node([])
         ),
+        "top_marks": wrong(
+            "a node over blocks that says too few leaves",
+            "RDM709",
+            pair,
+            payloads={"NODE": patched(7, "B", 1)},
+        ),
+        "top_marks_too_many": wrong(
+            "a node over blocks that says too many leaves",
+            "RDM709",
+            pair,
+            payloads={"NODE": patched(7, "B", 7)},
+        ),
         "box_exact": ("a plane that leaks by less than a float64 can tell", ["RDM707"], encode(_exact(-1.0))),
     }
     return made | _leaks(pair)
@@ -1012,9 +1029,21 @@ def _runs() -> dict[str, tuple[str, list[str], bytes]]:
             payloads={"RUNS": patched(0, "I", 1)},
         ),
         "runs_beyond": of("the runs of a block begin behind the last", "RDM801", *plain[0], payloads=falling),
-        "run_reserved": of(
-            "a reserved bit of a run", "RDM107", *plain[0], payloads={"RUNS": patched(9, "B", 0x81)}
+        "runs_padding": of(
+            "a byte between the numbers of runs and the runs",
+            "RDM108",
+            *plain[0],
+            payloads={"RUNS": patched(63, "B", 1)},
         ),
+        **{
+            name: of(about, "RDM804", *plain[0], payloads={"RUNS": flipped(8 * 64 + bit)})
+            for name, bit, about in (
+                ("run_strip", 11, "a run in another strip than it says"),
+                ("run_turn", 20, "a run with another turn than it says"),
+                ("run_turn_beyond", 26, "a run with the turn of a triangle that it does not have"),
+                ("run_before", 27, "a run with other triangles of its turn before it than it says"),
+            )
+        },
         "run_over_strips": of("a run over two strips", "RDM707 RDM802", (0, 3), (3, 1)),
         "run_over_blocks": of("a run that ends behind its block", "RDM802", (0, 2), (2, 3)),
         "run_too_long": of("a run longer than the longest", "RDM802", *plain[0], record={"longest_run": 1}),

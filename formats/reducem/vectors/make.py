@@ -204,7 +204,7 @@ def walk(strip: Strip) -> list[list[int]]:
 
 # Codecs
 
-WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 2, "RMAP": 4}
+WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4}
 
 
 def planes(data: bytes, width: int) -> bytes:
@@ -320,12 +320,15 @@ class Node(NamedTuple):
     shifts: tuple[int, int, int] = (0, 0, 0)
 
 
-def encode_node(node: Node) -> bytes:
-    """The 64 bytes of a node."""
+def encode_node(node: Node, is_top: bool) -> bytes:
+    """The 64 bytes of a node; one over blocks says which slots are leaves."""
     slots = [*node.slots, *[None] * (8 - len(node.slots))]
     inner = sum((slot is not None and slot.is_inner) << i for i, slot in enumerate(slots))
+    marks = sum((slot is not None and not slot.is_inner) << i for i, slot in enumerate(slots)) * is_top
     x, y, z = node.shifts
-    head = struct.pack("<II3HBB", node.base | x << 28, node.leaves, *node.origin, inner, y | z << 4)
+    head = struct.pack(
+        "<II3HBB", node.base | x << 28, node.leaves | marks << 24, *node.origin, inner, y | z << 4
+    )
     low = [slot.low[axis] if slot else 1 for axis in range(3) for slot in slots]
     high = [slot.high[axis] if slot else 0 for axis in range(3) for slot in slots]
     return head + bytes(low) + bytes(high)
@@ -363,6 +366,17 @@ def cut_runs(blocks: list[Block], longest: int = 8) -> list[list[tuple[int, int]
             first += length
         runs.append(here)
     return runs
+
+
+def run_word(block: Block, first: int, count: int) -> int:
+    """What RUNS has of a run; a strip's first triangle is like one of turn 1."""
+    turns = [(i, int(turn)) for i, strip in enumerate(block.strips) for turn in "1" + strip.turns]
+    strip, turn = turns[first]
+    equal = 0
+    while first > equal and turns[first - equal - 1] == (strip, turn):
+        equal += 1
+    word = first | count - 1 << 8 | strip << 11 | equal + 1 << 27
+    return word | sum(turn << 19 + j for j, (_, turn) in enumerate(turns[first : first + count]))
 
 
 def plain_nodes(
@@ -596,7 +610,7 @@ def container(plan: Plan, rows: list[tuple[str, int, int, bytes, bytes]]) -> byt
         table += record(ENTRY, entry | plan.entries.get(kind, {}))
         body += stored
     body += bytes([plan.padding]) * (-(start + len(body)) % 64)
-    header = {"magic": MAGIC, "major": 0, "minor": 3, "section_count": len(rows), "reserved": 0}
+    header = {"magic": MAGIC, "major": 0, "minor": 4, "section_count": len(rows), "reserved": 0}
     header["total_length"] = start + len(body)
     head = record(HEADER, header | plan.header)
     checksum = plan.header.get("checksum", zlib.crc32(head + table))
@@ -615,8 +629,11 @@ def sections(plan: Plan) -> dict[str, bytes]:
     runs = b""
     if plan.runs is not None:
         at = [sum(map(len, plan.runs[:i])) for i in range(len(plan.runs))]
-        words = [first | count - 1 << 8 for here in plan.runs for first, count in here]
-        runs = struct.pack(f"<{len(at)}I{len(words)}H", *at, *words)
+        words = [
+            run_word(block, *run) for block, here in zip(plan.blocks, plan.runs, strict=True) for run in here
+        ]
+        runs = struct.pack(f"<{len(at)}I", *at)
+        runs += bytes(-len(runs) % 64) + struct.pack(f"<{len(words)}I", *words)
     remap = b""
     if plan.remap is not None:
         remap = struct.pack(f"<{len(plan.remap)}I", *[face for face, _ in plan.remap])
@@ -628,7 +645,7 @@ def sections(plan: Plan) -> dict[str, bytes]:
         materials = json.dumps(materials, ensure_ascii=False).encode()
     if isinstance(metadata, dict):
         metadata = json.dumps(metadata, ensure_ascii=False).encode()
-    nodes = b"".join(encode_node(node) for node in plan.nodes or [])
+    nodes = b"".join(encode_node(node, i < plan.top) for i, node in enumerate(plan.nodes or []))
     made = (record(RECORD, scene_record(plan)), headers, data, nodes, runs, remap)
     geometries = b"".join(struct.pack("<4I", *row) for row in plan.geometries)
     instances = b"".join(struct.pack("<2I12d", *row[:2], *row[2]) for row in plan.instances)
