@@ -1,6 +1,7 @@
 """Packed blocks traced as they lie: the hits of the expanded walk, bit for bit, wherever rays come from."""
 
 import re
+from mmap import mmap
 
 import jax.numpy as jnp
 import numpy as np
@@ -290,6 +291,44 @@ def test_walks_are_hoisted(any_hit, steps, remap):
     assert 'xla_cpu_small_call="true"' in text
     assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
     assert loops_outside_hoisted_calls(text) == []
+
+
+def mapping_below(array):
+    """What an array's memory is in the end."""
+    while isinstance(array, np.ndarray) and array.base is not None:
+        array = array.base
+    return array.obj if isinstance(array, memoryview) else array
+
+
+@pytest.mark.parametrize("remap", [True, False])
+def test_stored_boxes_are_traced_where_the_file_is_mapped(tmp_path, remap):
+    path = tmp_path / "ball.rdm"
+    kept = scene_of(Mesh(*sphere(5)), remap=remap)
+    kept.storing_boxes().save(path)
+    scene = striptools.open(path)
+    sections = (scene.packed.nodes, scene.blocks.headers, scene.blocks.words, scene.packed.first_run)
+    for threads in (1, None):
+        tracer = Tracer(scene, device="cpu", threads=threads, resident="compressed")
+        on_device = tracer._scene
+        used = (on_device.nodes, on_device.headers, on_device.words, on_device.first_run, on_device.runs)
+        for section, array in zip((*sections, scene.packed.runs), used, strict=True):
+            assert isinstance(mapping_below(section), mmap)
+            places = [shard.data.unsafe_buffer_pointer() for shard in array.addressable_shards]
+            assert places == [section.ctypes.data] * len(tracer.devices)
+        places = [shard.data.unsafe_buffer_pointer() for shard in on_device.planes.addressable_shards]
+        assert places == [scene.packed.nodes.ctypes.data] * len(tracer.devices)
+    rays = rays_at(kept, 500, 5)
+    expected = both(kept)[0].closest_hit(*rays)
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(tracer.closest_hit(*rays), field), getattr(expected, field))
+    held = sum(section.nbytes for section in (*sections, scene.packed.runs))
+    assert tracer.resident_bytes - held <= 5 * scene.triangle_count
+
+
+def test_boxes_that_no_file_holds_are_copied_to_size_classes(ball):
+    one, two = (lay_out_packed(scene_of(Mesh(*sphere(3)), max_length=length)).arrays for length in (63, 64))
+    assert len(one.headers) == len(two.headers) == 1024
+    assert one.nodes.ctypes.data % 64 == 0
 
 
 def test_the_bottom_of_a_stack_is_done(ball):

@@ -25,7 +25,7 @@ LENGTHS = {
     "96": lambda n, b, m, r: 96,
     "32b": lambda n, b, m, r: 32 * b,
     "64m": lambda n, b, m, r: 64 * m,
-    "4b + 2r": lambda n, b, m, r: 4 * b + 2 * r,
+    "align(4b) + 4r": lambda n, b, m, r: -(-b // 16) * 64 + 4 * r,
     "4n + ceil(n/4)": lambda n, b, m, r: 4 * n + -(-n // 4),
 }
 """What the formulas in the specification's table of sections mean."""

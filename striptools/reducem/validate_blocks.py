@@ -195,7 +195,7 @@ def _rows(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Look at some blocks; gives strip begins, turns, triangle bounds, and bounds over all, where they are sound."""
+    """Look at some blocks; gives strip begins, turns, triangle bounds, and bounds of all, where sound."""
     strips = _strips(inspection, blocks, chunk)
     index = _indices(inspection, blocks, chunk)
     vertices = _vertices(inspection, blocks, chunk)

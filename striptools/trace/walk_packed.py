@@ -45,8 +45,6 @@ MARGIN = np.float32(2.0**-19)
 LANES = 8
 BLOCK_BITS = 0xFFFFFF
 ALL = np.uint32(0xFFFFFFFF)
-SLACK_WORDS = 16
-"""Words behind the stream that a load may touch: zeros of the file."""
 
 
 class PackedScene(NamedTuple):
@@ -56,7 +54,7 @@ class PackedScene(NamedTuple):
         nodes: (m, 16) uint32, SPEC 4.4.
         planes: (m, 64) uint8, the same memory.
         headers: (b, 8) uint32, SPEC 4.2.
-        words: (w,) uint32, the streams, `SLACK_WORDS` and more behind them.
+        words: (w,) uint32, the streams, and zeros behind them that a load may touch.
         first_run: (b,) uint32.
         runs: (r,) uint32, SPEC 4.5.
         faces: (n,) int32, the reported face of each triangle in file order; (0,) where they are their own.
