@@ -223,14 +223,19 @@ FAULTS = {
         (first_bottom(b), 1), n[first_bottom(b), 1] + np.uint32(1 << 24)
     ),
     "runs of blocks": lambda b, n, r, runs, first: first.__setitem__(0, 1),
-    "reserved bits": lambda b, n, r, runs, first: runs.__setitem__(0, runs[0] | 1 << 15),
+    "other leaves than it says": lambda b, n, r, runs, first: r.__setitem__(
+        (first_top(b), 7), r[first_top(b), 7] ^ 0x80
+    ),
     "every triangle once": lambda b, n, r, runs, first: runs.__setitem__(0, runs[0] ^ 1),
 }
 
 
+def first_top(ball):
+    return node_with(ball, lambda k, inner, leaves, used: k < ball.packed.top_count and leaves)
+
+
 def swap(nodes, ball):
-    top = node_with(ball, lambda k, inner, leaves, used: k < ball.packed.top_count and leaves)
-    nodes[top, 1] += 1
+    nodes[first_top(ball), 1] += 1
 
 
 @pytest.mark.parametrize("flaw", FAULTS)

@@ -45,7 +45,7 @@ def section(data, kind):
         ("unused_word", "RDM605", b"BLKD", 127),
         ("leak_high_y", "RDM707", b"NODE", 64 + 16),
         ("run_of_another_block", "RDM704", b"NODE", 128 + 4),
-        ("run_overlap", "RDM803", b"RUNS", 8),
+        ("run_overlap", "RDM803", b"RUNS", 64),
         ("remap_beyond", "RDM502", b"RMAP", 16),
         ("rotation", "RDM501", b"RMAP", 21),
         ("metadata_bytes", "RDM901", b"META", 7),
