@@ -425,7 +425,7 @@ def test_nodes_of_another_geometry_are_found():
     with pytest.raises(UnreadableSceneError, match=r"RDM703|RDM542|RDM543"):
         replace(scene, geometries=replace(scene.geometries, rows=rows)).check()
     nodes = scene.packed.nodes.copy()
-    nodes[int(scene.roots.tops[1]), 1] = 0
+    nodes[int(scene.roots.tops[1]), 1] &= 0xFF000000
     with pytest.raises(UnreadableSceneError, match="RDM703"):
         replace(scene, packed=replace(scene.packed, nodes=nodes)).check()
 
