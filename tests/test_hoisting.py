@@ -25,7 +25,7 @@ def loops_outside_hoisted_calls(text):
 
 def compiled_text(any_hit, steps=False):
     tracer = Tracer(small_scene(), device="cpu")
-    options = tracer._options(any_hit=any_hit, steps=steps)
+    options = tracer._options(any_hit=any_hit, count=steps)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
     lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
     return lowered.compile().as_text()

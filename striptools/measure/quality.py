@@ -176,8 +176,10 @@ def traversal_steps(tracer: "Tracer", origins: RayVectors, directions: RayVector
         origins: (r, 3).
         directions: (r, 3), r >= 1.
     """
-    steps = tracer.closest_hit(origins, directions, steps=True).steps
-    return 0.0 if steps is None or len(steps) == 0 else float(steps.mean(dtype=np.float64))
+    counters = tracer.closest_hit(origins, directions, counters=True).counters
+    if counters is None or len(origins) == 0:
+        return 0.0
+    return float(counters.steps.mean(dtype=np.float64))
 
 
 def _areas(boxes: Boxes, starts: Counts) -> tuple[float, float, float]:

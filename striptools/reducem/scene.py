@@ -9,7 +9,9 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from striptools.hierarchies.options import OverName
 from striptools.hierarchies.packed import BoxGrid, PackedNodes, Roots, box_grid, build_inner
+from striptools.hierarchies.stored import StoredHierarchy
 from striptools.mesh.attributes import Attribute, Material, follow
 from striptools.mesh.clean import weld_vertices
 from striptools.mesh.instances import Geometries, Instances
@@ -74,6 +76,7 @@ class Scene:
             faces each is. Positions, bounds, boxes and `error_bound` are then in the geometries' own frames,
             before any matrix, and so are `faces`, `triangle_count` and all else here that is not placed.
         instances: Where they stand; there where `geometries` are.
+        hierarchy: What stands in the place of the default one, or None.
     """
 
     blocks: Blocks
@@ -91,6 +94,7 @@ class Scene:
     origin: Origin | None = field(default_factory=lambda: None)
     geometries: SceneGeometries | None = field(default_factory=lambda: None)
     instances: SceneInstances | None = field(default_factory=lambda: None)
+    hierarchy: StoredHierarchy | None = field(default_factory=lambda: None)
 
     @classmethod
     def lazily(cls, load: Callable[[str, "Scene"], object], check: Callable[["Scene"], None]) -> "Scene":
@@ -238,6 +242,12 @@ class Scene:
     def triangle_boxes(self, threads: int | None = None) -> Boxes:
         """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
         return face_boxes(self.positions, self.faces(), threads or every_core())
+
+    def objects(self, over: OverName) -> Counts:
+        """(p+1,) int32: the first triangle, in file order, of each object a hierarchy is over, then n."""
+        if over == "triangles":
+            return np.arange(self.triangle_count + 1, dtype=np.int32)
+        return self.starts if over == "strips" else self.block_starts
 
     def with_boxes(self, threads: int | None = None) -> PackedNodes:
         """The complete hierarchy: as stored, or built and kept where boxes are not stored.

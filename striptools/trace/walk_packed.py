@@ -36,14 +36,31 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
+from striptools.trace.counters import Counters
 from striptools.trace.numerics import folded, index
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
-from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
+from striptools.trace.walk import (
+    DONE,
+    Best,
+    Decode,
+    Frame,
+    Traced,
+    WalkOptions,
+    replaced,
+    walk_rays,
+)
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
 
 LANES = 8
+
+LEAF_BYTES = 40
+"""What a leaf reads beside its triangles: the run, where the block's runs begin, and the block's header."""
+
+TRIANGLE_BYTES = 3 + 3 * 10
+"""What a triangle reads, about: three indices of a byte and three vertices of 80 bits."""
+
 BLOCK_BITS = 0xFFFFFF
 ALL = np.uint32(0xFFFFFFFF)
 SLACK_WORDS = 16
@@ -135,6 +152,19 @@ class PackedScene(NamedTuple):
         triangle = (first + lane).astype(jnp.int32)
         found = _any((t > 0) & (t <= best.t))
         return lax.cond(found, lambda: self._merged(best, t, triangle, options.any_hit), lambda: best)
+
+    def triangles_of(self, child: Array) -> Array:
+        """() int32: how many triangles a run has."""
+        return jnp.where(child < 0, (self._run_of(child)[1] >> 8 & 7) + 1, 0).astype(jnp.int32)
+
+    def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
+        """A node is eight boxes and 64 bytes; a leaf a run, a header, indices and vertices: see the notes."""
+        bytes_read = leaves * LEAF_BYTES + triangles * TRIANGLE_BYTES
+        return Counters(nodes, leaves, nodes * 8, triangles, nodes * 64, bytes_read)
+
+    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+        """Walk r rays made ready."""
+        return walk_rays(self, ready, options)
 
     def _merged(self, best: Best, t: Array, triangle: Array, any_hit: bool) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
