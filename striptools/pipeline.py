@@ -57,7 +57,7 @@ class Options:
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:
-        UsageError: `threads` is below 1, `boxes` is neither, or they are to be stored under another hierarchy.
+        UsageError: `threads` is below 1, `boxes` is neither, or stored under another hierarchy.
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)

@@ -155,7 +155,7 @@ def check_placing(scene: Scene, where: str) -> None:
 
 
 def check_parts(scene: Scene, where: str) -> None:
-    """Make sure that plain triangles stand in the place of blocks where the hierarchy asks for it, only there.
+    """Make sure that plain triangles stand in the place of blocks where the hierarchy asks for it.
 
     Raises:
         UnreadableSceneError: They do not.

@@ -110,11 +110,16 @@ def _tree(left: Counts, right: Counts, root: int, place: str) -> _Tree:
     return _Tree(left, right, levels[:-1])
 
 
-def _all_reached(tree: _Tree, place: str) -> None:
-    reached = np.zeros(len(tree.left), np.bool_)
-    reached[np.concatenate(tree.levels)] = True
-    if not reached.all():
-        raise unreadable("RDM564", f"{place}: node {np.flatnonzero(~reached)[0]}")
+def _check_in_preorder(tree: _Tree, place: str) -> None:
+    """Make sure that all nodes are reached, and stand one subtree behind the other."""
+    size = np.ones(len(tree.left), np.int64)
+    for level in reversed(tree.levels):
+        inner = level[tree.left[level] >= 0]
+        size[inner] += size[tree.left[inner]] + size[tree.right[inner]]
+    inner = np.flatnonzero(tree.left >= 0)
+    apart = tree.right[inner] != tree.left[inner] + size[tree.left[inner]]
+    if size[0] != len(size) or apart.any():
+        raise unreadable("RDM564", f"{place}: node {inner[apart][0] if apart.any() else 0}")
 
 
 def _order(items: np.ndarray | None, count: int, place: str) -> np.ndarray:
@@ -192,7 +197,7 @@ def _preorder(nodes: np.ndarray, place: str) -> tuple[_Tree, Counts]:
     number = np.arange(len(nodes))
     right = np.where(is_inner, nodes[:, 6].astype(np.int64), -1)
     tree = _tree(np.where(is_inner, number + 1, -1), right, 0, place)
-    _all_reached(tree, place)
+    _check_in_preorder(tree, place)
     return tree, np.flatnonzero(~is_inner)
 
 
@@ -213,20 +218,26 @@ def _check_presorted(scene: "Scene", hierarchy: Presorted, place: str) -> None:
     if starts[0] != 0 or starts[-1] != scene.triangle_count or (np.diff(starts) < 1).any():
         raise unreadable("RDM567", place)
     boxes = scene.triangle_boxes()
-    _check_slabs(boxes, starts, place)
+    trees = range_boxes(boxes, starts.astype(np.int32))
     if len(nodes) == 0:
+        _check_slabs(boxes, starts, _root_axes(trees), place)
         return
     tree, leaves = _preorder(nodes, place)
-    if (nodes[leaves, 7] != 1).any():
-        raise unreadable("RDM563", place)
-    trees = nodes[leaves, 6].astype(np.int64)
-    _check_once(trees, np.ones_like(trees), len(starts) - 1, place)
+    first, held = nodes[leaves, 6].astype(np.int64), nodes[leaves, 7].astype(np.int64)
+    if not (np.array_equal(first, starts[:-1]) and np.array_equal(held, np.diff(starts))):
+        raise unreadable("RDM566", place)
+    _check_slabs(boxes, starts, _root_axes(nodes[leaves, :6].view(np.float32)), place)
     contents = np.zeros((len(nodes), 6), np.float32)
-    contents[leaves] = range_boxes(boxes, starts.astype(np.int32))[trees]
+    contents[leaves] = trees
     _check_boxes(nodes, np.arange(len(nodes)), tree.contents(contents), place)
 
 
-def _check_slabs(boxes: Boxes, starts: Counts, place: str) -> None:
+def _root_axes(boxes: Boxes) -> np.ndarray:
+    """The axis of the root of each tree: the one before the longest side of its box."""
+    return (np.argmax(boxes[:, 3:].astype(np.float64) - boxes[:, :3], axis=1) + 2) % 3
+
+
+def _check_slabs(boxes: Boxes, starts: Counts, axes: np.ndarray, place: str) -> None:
     """Make sure that the two triangles of each node span all below it on the node's axis."""
     sizes = np.diff(starts)
     counts = (sizes + 1) // 2
@@ -243,7 +254,7 @@ def _check_slabs(boxes: Boxes, starts: Counts, place: str) -> None:
         for child in (level[number[level] % 2 == 1], level[number[level] % 2 == 0]):
             parent = begin[tree[child]] + (number[child] - 1) // 2
             below[parent] = _union(below[parent], below[child])
-    rows, axis = np.arange(len(own)), depth % 3
+    rows, axis = np.arange(len(own)), (axes[tree] + depth) % 3
     wrong = (own[rows, axis] > below[rows, axis]) | (own[rows, axis + 3] < below[rows, axis + 3])
     if wrong.any():
         raise unreadable("RDM568", f"{place}: triangle {pairs[np.flatnonzero(wrong)[0]]}")
@@ -259,20 +270,20 @@ def _check_cells(scene: "Scene", hierarchy: KdTree, objects: Counts, place: str)
     number = np.arange(len(nodes))
     left = np.where(is_inner, number + 1, -1)
     tree = _tree(left, np.where(is_inner, value, -1), 0, place)
-    _all_reached(tree, place)
+    _check_in_preorder(tree, place)
     leaves = np.flatnonzero(~is_inner)
     first, held = nodes[leaves, 0].astype(np.int64), value[leaves]
-    there = held > 0
-    if (first > len(references)).any() or not there.any():
+    if (first != np.cumsum(held) - held).any() or held.sum() != len(references):
         raise unreadable("RDM566", place)
-    _check_once(first[there], held[there], len(references), place)
-    if (references >= len(objects) - 1).any():
+    leaf = np.repeat(np.arange(len(leaves)), held)
+    falls = (np.diff(references) <= 0) & (np.diff(leaf) == 0)
+    if falls.any() or (references >= len(objects) - 1).any():
         raise unreadable("RDM567", place)
     root = np.concatenate([hierarchy.low, hierarchy.high])
     if not ((root[:3] <= scene.low).all() and (root[3:] >= scene.high).all()):
         raise unreadable("RDM568", f"{place}: node 0")
     cells = _cells(tree, nodes, axis, root, place)
-    _check_corners(scene, objects, cells[leaves], (first, held), references, place)
+    _check_corners(scene, objects, cells[leaves][leaf], references, place)
 
 
 def _cells(tree: _Tree, nodes: np.ndarray, axes: np.ndarray, root: np.ndarray, place: str) -> Boxes:
@@ -292,19 +303,16 @@ def _cells(tree: _Tree, nodes: np.ndarray, axes: np.ndarray, root: np.ndarray, p
     return cells
 
 
-def _check_corners(
-    scene: "Scene",
-    objects: Counts,
-    cells: Boxes,
-    leaves: tuple[Counts, Counts],
-    references: np.ndarray,
-    place: str,
-) -> None:
-    """Make sure that each corner of each triangle lies in a leaf that refers to the triangle's object."""
-    leaf = np.zeros(len(references), np.int64)
-    first, held = leaves
-    order = np.argsort(first[held > 0], kind="stable")
-    leaf[:] = np.repeat(np.flatnonzero(held > 0)[order], held[held > 0][order])
+def _check_corners(scene: "Scene", objects: Counts, cells: Boxes, references: np.ndarray, place: str) -> None:
+    """Make sure that each corner of each triangle lies in a leaf that refers to the triangle's object.
+
+    Args:
+        scene: Whose triangles they are.
+        objects: (p+1,) int32, the first triangle of each object, then n.
+        cells: (k, 6) float32, the cell of the leaf of each reference.
+        references: (k,) the object of each.
+        place: What an error names as its place.
+    """
     begin, sizes = objects[references].astype(np.int64), np.diff(objects)[references].astype(np.int64)
     corners, found = scene.positions[scene.faces()], np.zeros((scene.triangle_count, 3), np.bool_)
     ends = np.cumsum(sizes)
@@ -314,7 +322,7 @@ def _check_corners(
         end = max(at + 1, int(np.searchsorted(ends, ends[at] - sizes[at] + CHUNK)))
         row = np.repeat(np.arange(at, end), sizes[at:end])
         triangle = begin[row] + np.arange(len(row)) - (ends - sizes - (ends[at] - sizes[at]))[row]
-        cell = cells[leaf[row]][:, None]
+        cell = cells[row][:, None]
         inside = ((corners[triangle] >= cell[..., :3]) & (corners[triangle] <= cell[..., 3:])).all(axis=2)
         which, corner = np.nonzero(inside)
         found[triangle[which], corner] = True

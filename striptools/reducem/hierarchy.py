@@ -1,8 +1,8 @@
-"""A scene under another hierarchy than the default one: what is built, and what then takes the place of what.
+"""A scene under another hierarchy than the default one: what is built, and what then takes whose place.
 
-SLBVH, kd-tree and loose octree stand over triangles, strips or blocks as the file has them, so that the blocks
-stay and only the nodes go. Presorted geometry is its own hierarchy, so that blocks go too. Each builder is
-imported where it is asked for.
+SLBVH, kd-tree and loose octree stand over triangles, strips or blocks as the file has them, so that blocks
+stay and only nodes go. Presorted geometry is its own hierarchy, so that blocks go too. Each builder is imported
+where it is asked for.
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ __all__ = ["scene_under"]
 
 def scene_under(scene: Scene, options: HierarchyOptions, threads: int) -> Scene:
     """The scene under the hierarchy that is asked for; see `Scene.under`."""
-    if options.name == "reducem" and scene.hierarchy is None or scene.triangle_count == 0:
+    if (options.name == "reducem" and scene.hierarchy is None) or scene.triangle_count == 0:
         return scene
     _refuse(scene, options)
     if options.name == "presorted":

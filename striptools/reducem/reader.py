@@ -408,7 +408,9 @@ class _File:
         count = self.record["triangle_count"]
         if layout.HIERARCHY.kind not in self.entries:
             return None
-        raw = self.section(layout.HIERARCHY, 1 if count else 0, layout.most_hierarchy_bytes(count) * bool(count))
+        raw = self.section(
+            layout.HIERARCHY, 1 if count else 0, layout.most_hierarchy_bytes(count) * bool(count)
+        )
         return decode_hierarchy(raw, self.where)
 
     def is_presorted(self) -> bool:

@@ -133,7 +133,8 @@ def _made(
     record: dict[str, Any], over: OverName, nodes: np.ndarray, items: np.ndarray, corners: Sequence[float]
 ) -> StoredHierarchy:
     if record["kind"] == 2:
-        return KdTree(over, nodes, items, *np.array(corners, np.float32).reshape(2, 3))
+        low, high = np.array(corners, np.float32).reshape(2, 3)
+        return KdTree(over, nodes, items, low, high)
     # What is too large for int32 comes out negative, and names nothing.
     numbers = items.view(np.int32)
     if record["kind"] == 4:
