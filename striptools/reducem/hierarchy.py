@@ -1,7 +1,7 @@
 """A scene under another hierarchy than the default one: what is built, and what then takes whose place.
 
 SLBVH, kd-tree and loose octree stand over triangles, strips or blocks as the file has them, so that blocks
-stay and only nodes go. Presorted geometry is its own hierarchy, so that blocks go too. Each builder is imported
+stay and only nodes go. Presorted geometry is its own hierarchy, so that blocks go too. A builder is imported
 where it is asked for.
 """
 
