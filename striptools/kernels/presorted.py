@@ -59,6 +59,22 @@ def top_nodes(size, boxes, levels, words, floats, starts):
     return nodes, leaves
 
 
+@kernel
+def plain_depth(words):
+    """The most nodes on a way down the plain nodes, (t, 8) uint32; a child that is none, or before its parent,
+    counts for nothing."""
+    depth = np.zeros(len(words), np.int64)
+    most = 0
+    for node in range(len(words)):
+        depth[node] += 1
+        most = max(most, depth[node])
+        if words[node, 7] == 0:
+            for child in (node + 1, np.int64(words[node, 6])):
+                if node < child < len(words):
+                    depth[child] = max(depth[child], depth[node])
+    return most
+
+
 @inlined
 def left_share(count):
     """How many triangles go left below a node that owns two of `count`, three or more."""
