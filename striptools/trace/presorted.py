@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from striptools.reducem.placed import Placed
     from striptools.reducem.scene import Scene
 
-NodeTest = Literal["direct", "sparing"]
+NodeTest = Literal["direct", "bandwidth"]
 
 MOST_TRIANGLES = 2**26
 """A triangle's place, times 32, still fits 31 bits."""
@@ -49,7 +49,7 @@ def lay_out_presorted(
     nodes = _nodes(hierarchy, boxes, held.scale)
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     frame = Frame(held.scale, reach_of(scene, held.scale), zero, one, MARGIN)
-    kind = PresortedScene if node_test == "sparing" else DirectScene
+    kind = PresortedScene if node_test == "bandwidth" else DirectScene
     arrays = kind(held.blocks.reshape(-1, 3, 3), faces, nodes, frame)
     depth = plain_depth(hierarchy.nodes) + tree_depth(int(np.diff(hierarchy.starts).max()))
     return SingleLayout(arrays, held, depth, nodes[0, :6].view(np.float32))

@@ -10,7 +10,7 @@ Two ways to test a node, hits the same:
 *direct*, which the paper took on the graphics cards of its day: six coordinates give the slab; where the ray
 meets it, both triangles are tested.
 
-*sparing*, the bandwidth order: where the ray meets the slab, each triangle's own slab on that axis is made of
+*by bandwidth*: where the ray meets the slab, each triangle's own slab on that axis is made of
 the coordinates at hand; only where it is met the next axis is loaded, and then the third; only where all six
 planes pass the triangle is tested.
 
@@ -109,7 +109,7 @@ class Place(NamedTuple):
 
 
 class PresortedScene(NamedTuple):
-    """A presorted scene whose nodes are tested sparingly.
+    """A presorted scene whose nodes are tested by bandwidth.
 
     Attributes:
         corners: (n', 3, 3) float32, scaled: triangle, axis, corner in the canonical order of the tests.
@@ -125,7 +125,7 @@ class PresortedScene(NamedTuple):
     frame: Frame
 
     @property
-    def sparing(self) -> bool:
+    def by_bandwidth(self) -> bool:
         """How nodes are tested."""
         return True
 
@@ -148,7 +148,7 @@ class DirectScene(PresortedScene):
     """The same, whose triangles are tested wherever a node is hit."""
 
     @property
-    def sparing(self) -> bool:
+    def by_bandwidth(self) -> bool:
         """How nodes are tested."""
         return False
 
@@ -166,18 +166,20 @@ def _walk(scene: PresortedScene, ray: ReadyRay, stack: Array, options: WalkOptio
     def goes_on(place: Place) -> Array:
         return (place.node >= 0) & (place.turns <= scene.most_turns)
 
-    def is_inner(place: Place) -> Array:
-        return goes_on(place) & (_word(scene, place.node, 7) == 0)
+    def in_reach(place: Place, found: Found) -> Array:
+        return goes_on(place) & (place.span.entry <= found.nearest * SLACK)
+
+    def is_inner(carried: tuple[Place, Array, Found]) -> Array:
+        place, _, found = carried
+        return in_reach(place, found) & (_word(scene, place.node, 7) == 0)
 
     def descend_then_sort_out(carried: tuple[Place, Array, Found]) -> tuple[Place, Array, Found]:
-        place, stack, found = lax.while_loop(
-            lambda c: is_inner(c[0]), lambda c: _visit_plain(scene, ray, *c), carried
-        )
+        place, stack, found = lax.while_loop(is_inner, lambda c: _visit_plain(scene, ray, *c), carried)
         leaf = place.node
         below = Tree(_word(scene, leaf, 6), zero, _word(scene, leaf, 7) & 3)
         below = below._replace(end=below.first + (_word(scene, leaf, 7) >> 2))
         floor = place.height
-        at_leaf = goes_on(place)
+        at_leaf = in_reach(place, found) & (_word(scene, leaf, 7) != 0)
         root = place._replace(node=jnp.where(at_leaf, below.first, NONE), axis=below.axis)
         found = found.counting(_A_LEAF, at_leaf)
 
@@ -248,7 +250,7 @@ def _visit_presorted(
     found = found.counting(_A_NODE + _A_SLAB).counting(_AN_AXIS, jnp.where(has_two, 2, 1))
 
     def test(found: Found) -> Found:
-        if not scene.sparing:
+        if not scene.by_bandwidth:
             found = _test(scene, ray, place.node, jnp.bool_(True), found)
             found = _test(scene, ray, place.node + 1, has_two, found)
             return found.counting(2 * _AN_AXIS, jnp.where(has_two, 2, 1))
@@ -256,7 +258,7 @@ def _visit_presorted(
             (place.node, (low_one, high_one), jnp.bool_(True)),
             (place.node + 1, (low_two, high_two), has_two),
         ):
-            found = _test_sparingly(scene, ray, triangle, there, sides, place.axis, span, found)
+            found = _test_by_bandwidth(scene, ray, triangle, there, sides, place.axis, span, found)
         return found
 
     found = lax.cond(met, test, lambda found: found, found)
@@ -289,7 +291,7 @@ def _test(scene: PresortedScene, ray: ReadyRay, triangle: Array, there: Array, f
     return Found(nearest, face, found.counts).counting(_A_TEST, there)
 
 
-def _test_sparingly(
+def _test_by_bandwidth(
     scene: PresortedScene,
     ray: ReadyRay,
     triangle: Array,
