@@ -445,7 +445,7 @@ def structure_flaw(nodes, references, low, high, objects, deepest):
         axis = np.int64(nodes[here, 1] & 3)
         if axis != LEAF:
             # Keep the cell above a split for later, and go on below it.
-            position = nodes[here, 0].view(np.float32)
+            position = np.uint32(nodes[here, 0]).view(np.float32)
             if depth == deepest:
                 return TOO_DEEP, here
             if not (cell[axis] < position and position < cell[3 + axis]):
@@ -518,7 +518,7 @@ def first_missed(nodes, references, low, high, boxes, corners):
     one of them where it lies in the plane.
     """
     # A frame is a node, its cell and the part; at most one waits a level, and one choice an axis.
-    deepest = 0 + depth_of(nodes)
+    deepest = depth_of(nodes)
     frames = np.empty((deepest + 2, 12), np.float32)
     frame_node = np.empty(deepest + 2, np.int64)
     choices = np.empty((deepest + 2, 12), np.float32)
@@ -557,7 +557,7 @@ def first_missed(nodes, references, low, high, boxes, corners):
                 continue
 
             # Go to both sides, or to one of them with the other for a choice.
-            position = nodes[node, 0].view(np.float32)
+            position = np.uint32(nodes[node, 0]).view(np.float32)
             above = np.int64(nodes[node, 1] >> 2)
             goes_below = now[6 + axis] < position
             goes_above = now[9 + axis] > position
