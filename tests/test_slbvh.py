@@ -506,11 +506,11 @@ def test_a_stack_would_be_seen():
 
 def test_a_heap_without_end_is_stuck_and_no_hang():
     scene = under(small_scene(), "triangles", "sah")
-    nodes = scene.hierarchy.nodes.copy()
-    nodes[:] = nodes[1]
-    nodes[:, PRIM_COUNT] &= ~np.uint32(LEAF)
-    nodes[0, PRIM_COUNT] |= LEAF
-    tracer = Tracer(replace(scene, hierarchy=replace(scene.hierarchy, nodes=nodes)), device="cpu")
+    tracer = Tracer(scene, device="cpu")
+    layout = lay_out_slbvh(scene, scene.hierarchy)
+    layout.arrays.nodes[:] = layout.arrays.nodes[1]
+    layout.arrays.nodes.view(np.uint32)[:, PRIM_COUNT] &= ~np.uint32(LEAF)
+    tracer._take(layout)
     with pytest.raises(StriptoolsError, match="did not end"):
         tracer.closest_hit([[0.5, 0.5, 9]], [[0.01, 0.01, -1]])
 
