@@ -4,10 +4,10 @@ Source: Murguia et al., "Bit-Trail Traversal for Stackless LBVH on DirectCompute
 order, the node of 32 bytes, the trail (`trace/walk_slbvh.py`).
 
 Differences and decisions:
-1. Both builds halve by count, so that a heap has the least depth there is for its leaves: "morton" along the
-   order of the Morton codes of the box centres, "sah" along the axis whose halves cost least by the surface
-   area heuristic, centres in order, equal ones by index. Which objects a node has is then known before any
-   box is looked at: a level at a time, the left half the larger.
+1. Both builds halve by count, the left half the larger, so that a heap has the least depth there is for its
+   leaves: "morton" along the order of the Morton codes of the box centres; "sah" along the axis whose halves
+   cost least by the surface area heuristic (of equal ones that of the widest centres), centres in order,
+   equal ones by index. How many objects a node has is known, level by level, before any box is looked at.
 2. The axis of a "morton" node, by which the near child is found, is the one along which its right child's
    box lies farthest behind its left child's.
 3. An inner node's PrimCount and PrimPos tell what lies below it; an empty node is 32 bytes of zeros, as
@@ -190,7 +190,8 @@ def check_slbvh(slbvh: Slbvh, boxes: Boxes) -> None:
 
     Each inner node splits its places into those of its two children, which are not empty; the root has all
     of them; nothing hangs below a leaf or an empty node: so each place is in one leaf, reached from the root
-    once. Leaves have the boxes of their objects and inner nodes of their children: by induction, of all below.
+    once. Leaves have the boxes of their objects and inner nodes those of their children: by induction, of
+    all that is below.
 
     Args:
         slbvh: The heap in question.

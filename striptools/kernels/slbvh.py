@@ -17,7 +17,7 @@ COUNT_SHIFT = 3
 MOST_WAITING = 32
 
 Lists = namedtuple("Lists", "items spare goes_left")
-"""items (3, p) int32: in each range, its objects by rising centre on each axis; room for p int32 and p uint8."""
+"""items (3, p) int32, in each range its objects by rising centre on each axis; room for p int32 and uint8."""
 
 
 @inlined
@@ -63,16 +63,29 @@ def area_around(boxes, items, axis, begin, end):
     return half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z)
 
 
+@inlined
+def centre(boxes, item, axis):
+    """Twice the centre of a box along an axis, in float64, where the sum of two float32 cannot overflow."""
+    return np.float64(boxes[item, axis]) + np.float64(boxes[item, 3 + axis])
+
+
 @helper
 def best_axis(boxes, lists, begin, middle, end):
-    """The axis along which halves have the least SAH cost, the first of equals."""
+    """The axis along which halves have the least SAH cost; of equals that of the widest centres, the first.
+
+    Two objects cost the same along any axis, but only along some do they lie one behind the other.
+    """
     best = np.inf
+    best_extent = -1.0
     chosen = 0
     for axis in range(3):
         cost = area_around(boxes, lists.items, axis, begin, middle) * (middle - begin)
         cost += area_around(boxes, lists.items, axis, middle, end) * (end - middle)
-        if cost < best:
+        extent = centre(boxes, lists.items[axis, end - 1], axis)
+        extent -= centre(boxes, lists.items[axis, begin], axis)
+        if cost < best or (cost == best and extent > best_extent):
             best = cost
+            best_extent = extent
             chosen = axis
     return chosen
 
@@ -167,9 +180,8 @@ def axes_from_boxes(words, floats):
         best = -np.inf
         chosen = 0
         for axis in range(3):
-            left = np.float64(floats[2 * node, axis]) + np.float64(floats[2 * node, 3 + axis])
-            right = np.float64(floats[2 * node + 1, axis]) + np.float64(floats[2 * node + 1, 3 + axis])
-            if right - left > best:
-                best = right - left
+            behind = centre(floats, 2 * node + 1, axis) - centre(floats, 2 * node, axis)
+            if behind > best:
+                best = behind
                 chosen = axis
         words[node, PRIM_COUNT] |= np.uint32(chosen)

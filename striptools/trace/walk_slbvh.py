@@ -47,8 +47,7 @@ class Place(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What a loop carries: the place, the leaf to test, the last one (which is empty) where there is none,
-    nodes visited."""
+    """What a loop carries: the place, the leaf to test (for none the last, it is empty), and the visits."""
 
     place: Place
     leaf: Array
@@ -115,7 +114,7 @@ def _walk(scene: SlbvhScene, ray: ReadyRay, options: WalkOptions) -> Ended:
         place = state.place
         if options.any_hit:
             found = best.nearest < ray.t_max
-            place = place._replace(node=jnp.where(found, jnp.uint32(0), place.node))
+            place = Place(jnp.where(found, jnp.uint32(0), place.node), jnp.where(found, 1, place.trail))
         if options.counting:
             counts = _counted(scene, state.leaf, counts)
         return _State(place, scene.no_leaf, state.turns), best, counts
@@ -126,7 +125,9 @@ def _walk(scene: SlbvhScene, ray: ReadyRay, options: WalkOptions) -> Ended:
     if options.counting:
         turns = state.turns
         counts = counts._replace(nodes=turns, boxes=turns, node_bytes=turns * NODE_BYTES)
-    return Ended(best, counts or no_counts(), state.place.node != 0)
+    # A trail whose levels went beyond its bits is not left at 1.
+    stuck = (state.place.node != 0) | (state.place.trail != 1)
+    return Ended(best, counts or no_counts(), stuck)
 
 
 def _visit(scene: SlbvhScene, ray: ReadyRay, state: _State, limit: Array) -> _State:
