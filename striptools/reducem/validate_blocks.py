@@ -12,7 +12,13 @@ import numpy as np
 from striptools.reducem.inspection import Inspection, Section
 
 __all__ = [
-    *("Blocks", "Geometry", "grid_of", "inspect_blocks", "inspect_bounds", "inspect_headers", "off_grid"),
+    "Blocks",
+    "Geometry",
+    "grid_of",
+    "inspect_blocks",
+    "inspect_bounds",
+    "inspect_headers",
+    "off_grid",
 ]
 
 _AT_ONCE = 1 << 15

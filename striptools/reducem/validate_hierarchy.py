@@ -96,8 +96,7 @@ def _opened(inspection: Inspection, section: Section) -> _Look | None:
     if len(data) < 64:
         inspection.found("RDM562", "HIER", section.offset)
         return None
-    *head, b0, b1, b2, b3, b4, b5 = struct.unpack_from("<4B3I6f", data)
-    record = _Record(*head, (b0, b1, b2, b3, b4, b5))
+    record = _Record(*struct.unpack_from("<4B3I", data), struct.unpack_from("<6f", data, 16))
     if record.flags > 1 or record.reserved or record.reserved_2 or any(data[40:64]):
         inspection.found("RDM107", "HIER", section.offset)
     if record.over not in _OVER.get(record.kind, ()) or (record.kind in (2, 4) and record.flags & 1):
@@ -147,7 +146,7 @@ def _ranges(low: np.ndarray, high: np.ndarray, starts: np.ndarray) -> np.ndarray
 def _held(look: _Look, below: np.ndarray, reached: np.ndarray) -> None:
     """Look whether the boxes of nodes that are reached hold what is below them, (m, 6)."""
     inside = (look.nodes["low"] <= below[:, :3]) & (look.nodes["high"] >= below[:, 3:])
-    look.found("RDM568", ~inside.all(axis=1) & reached)
+    look.found("RDM568", np.array(~inside.all(axis=1) & reached))
 
 
 def _heap(look: _Look, boxes: np.ndarray) -> None:
@@ -183,7 +182,7 @@ def _heap(look: _Look, boxes: np.ndarray) -> None:
         at = begin + np.flatnonzero(inner[begin : 2 * begin])
         below[at, :3] = np.minimum(below[2 * at, :3], below[2 * at + 1, :3])
         below[at, 3:] = np.maximum(below[2 * at, 3:], below[2 * at + 1, 3:])
-    return _held(look, below, there)
+    return _held(look, below, np.array(there))
 
 
 @dataclass(frozen=True)
@@ -381,5 +380,5 @@ def _corners(look: _Look, geometry: Geometry, objects: np.ndarray, cells: np.nda
         inside = ((geometry.corners[triangle] >= low) & (geometry.corners[triangle] <= high)).all(axis=2)
         np.logical_or.at(held, triangle, inside)
     look.inspection.found_where(
-        "RDM568", ~held.all(axis=1), lambda t: f"HIER: triangle {t}", lambda t: look.section.offset
+        "RDM568", np.array(~held.all(axis=1)), lambda t: f"HIER: triangle {t}", lambda t: look.section.offset
     )

@@ -21,7 +21,10 @@ def inspect_triangles(inspection: Inspection) -> Geometry | None:
 
     def check(code: str, wrong: np.ndarray, word: str, at: int) -> bool:
         return inspection.found_where(
-            code, wrong.any(axis=1), lambda i: f"TRIS: {word} {i}", lambda i: section.at(at + 12 * i)
+            code,
+            np.array(wrong.any(axis=1)),
+            lambda i: f"TRIS: {word} {i}",
+            lambda i: section.at(at + 12 * i),
         )
 
     endless = check("RDM575", ~np.isfinite(positions), "vertex", 0)
