@@ -478,7 +478,7 @@ def test_info_has_the_names_that_programs_rely_on(run, folder: Path) -> None:
     assert facts["metadata"]["generator"] == f"striptools {striptools.__version__}"
     assert facts["strips"] == scene.strip_count
     assert facts["vertices_per_triangle"] == pytest.approx(1 + 2 * scene.strip_count / 576)
-    assert facts["format_version"] == "0.3"
+    assert facts["format_version"] == "0.4"
     assert facts["flips"] == 0
     assert facts["precision"] == {"kind": "lossless", "bits": 32, "error_bound": 0.0}
     parts = facts["bytes"]

@@ -224,6 +224,8 @@ def _other_hierarchy(
         found = inspection.sections.get("HIER")
     if entry is None or (found is not None and found.data[0] != 4):
         lengths["TRIS"] = (0, 0)
+    elif found is None:
+        lengths["TRIS"] = (0, lengths["TRIS"][1])
 
 
 def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str, tuple[int, int]]:
