@@ -14,8 +14,9 @@ from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene
 from striptools.reducem.validate import validate
 
-SMALL = ("triangle", "remap_flips", "boxes_two_blocks", "metadata", "unknown_sections")
-DEEP = ("boxes_triangle", "flips", "mode_1_narrow")
+SMALL = ("triangle", "remap_flips", "boxes_two_blocks", "metadata", "unknown_sections", "presorted_one_tree")
+DEEP = ("boxes_triangle", "flips", "mode_1_narrow", "heap_strips", "loose_strips", "cells_strips")
+DEEP += ("presorted_one_tree",)
 MOST_SECONDS = 2.0
 MOST_BYTES = 30_000_000
 

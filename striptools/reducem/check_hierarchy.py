@@ -280,7 +280,8 @@ def _check_cells(scene: "Scene", hierarchy: KdTree, objects: Counts, place: str)
     if falls.any() or (references >= len(objects) - 1).any():
         raise unreadable("RDM567", place)
     root = np.concatenate([hierarchy.low, hierarchy.high])
-    if not ((root[:3] <= scene.low).all() and (root[3:] >= scene.high).all()):
+    low, high = scene.positions.min(axis=0), scene.positions.max(axis=0)
+    if not ((root[:3] <= low).all() and (root[3:] >= high).all()):
         raise unreadable("RDM568", f"{place}: node 0")
     cells = _cells(tree, nodes, axis, root, place)
     _check_corners(scene, objects, cells[leaves][leaf], references, place)
