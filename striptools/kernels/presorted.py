@@ -99,7 +99,9 @@ def lowest(boxes, items, axis, begin, end):
         one, two = items[axis, place], items[axis, best]
         if boxes[one, axis] > boxes[two, axis]:
             continue
-        if boxes[one, axis] < boxes[two, axis] or before(boxes[one, axis + 3], boxes[two, axis + 3], one, two):
+        if boxes[one, axis] < boxes[two, axis] or before(
+            boxes[one, axis + 3], boxes[two, axis + 3], one, two
+        ):
             best = place
     return best
 
@@ -208,7 +210,7 @@ def sort_range(boxes, items, spare, side, order, base, begin, end, node, axis, g
 
 
 @kernel
-def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
+def sort_trees(boxes, items, spare, side, order, starts, first, last):
     """Sort the trees `first:last`, see `sort_range`.
 
     Args:
@@ -218,7 +220,6 @@ def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
         side: (n,) uint8, room, zeros.
         order: (n,) int32, written.
         starts: (r+1,) int32.
-        axes: (r,) int64, of the roots' slabs.
         first: The first tree.
         last: One more than the last.
     """
@@ -226,24 +227,23 @@ def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
     for tree in range(first, last):
         begin, end = np.int64(starts[tree]), np.int64(starts[tree + 1])
         sort_range(
-            boxes, items, spare, side, order, begin, begin, end, np.int64(0), axes[tree], np.int64(0), jobs
+            boxes, items, spare, side, order, begin, begin, end, np.int64(0), np.int64(0), np.int64(0), jobs
         )
 
 
 @kernel
-def first_spill(boxes, starts, axes):
+def first_spill(boxes, starts):
     """The first triangle of a node whose slab does not hold what is below it; -1 where there is none.
 
     Args:
         boxes: (n, 6) float32, of triangles in their places.
         starts: (r+1,) int32, rising from 0 to n.
-        axes: (r,) int64, of the roots' slabs.
     """
     longest = 0
-    for tree in range(len(axes)):
+    for tree in range(len(starts) - 1):
         longest = max(longest, starts[tree + 1] - starts[tree])
     span = np.empty(((longest + 1) // 2, 6), np.float32)
-    for tree in range(len(axes)):
+    for tree in range(len(starts) - 1):
         base = np.int64(starts[tree])
         count = starts[tree + 1] - base
         nodes = (count + 1) // 2
@@ -260,7 +260,7 @@ def first_spill(boxes, starts, axes):
             for k in range(3):
                 span[node, k] = min(boxes[place, k], boxes[also, k])
                 span[node, 3 + k] = max(boxes[place, 3 + k], boxes[also, 3 + k])
-            axis = (axes[tree] + depth) % 3
+            axis = depth % 3
             low, high = span[node, axis], span[node, 3 + axis]
             # Join what is below, and compare; a comparison with NaN says no.
             for child in range(2 * node + 1, min(2 * node + 3, nodes)):
