@@ -11,8 +11,8 @@ area heuristic, at most (2**n - 1) * 32 bytes, and each of their leaves is a pre
 Differences and decisions:
 
 1. Of the triangles that begin first on the axis the one that ends last is owned, then the one of least
-   number; then, of the others, that which ends last. Where the first spans both planes the second is therefore
-   the one that reaches farthest of the rest.
+   number; then, of the others, that which ends last. Where the first spans both planes the second is
+   therefore the one that reaches farthest of the rest.
 2. The rest is halved by centre on the axis of the children: what cuts them apart is what their own slabs
    tell. Equal centres go by number.
 3. "Halves" are the shares of a left-packed heap: all levels but the last are full, and where the count is
@@ -252,5 +252,5 @@ def _error(flaw: str, where: str) -> UnreadableSceneError:
 
 
 # Notes. Tried and lost: a root whose axis is the one before the longest side of its tree's box, so that the
-# first halving is across that side, saves 0 to 4 % of the nodes visited (bunny, chandelier, dem_jacksboro; 0 to
-# 14 levels): not worth a rule that every reader would have to know.
+# first halving is across that side, saves 0 to 4 % of the nodes visited (bunny, chandelier, dem_jacksboro;
+# 0 to 14 levels): not worth a rule that every reader would have to know.

@@ -61,8 +61,10 @@ def top_nodes(size, boxes, levels, words, floats, starts):
 
 @kernel
 def plain_depth(words):
-    """The most nodes on a way down the plain nodes, (t, 8) uint32; a child that is none, or before its parent,
-    counts for nothing."""
+    """The most nodes on a way down plain nodes, (t, 8) uint32.
+
+    A child that is none, or stands before its parent, counts for nothing.
+    """
     depth = np.zeros(len(words), np.int64)
     most = 0
     for node in range(len(words)):
@@ -91,40 +93,37 @@ def left_share(count):
 
 
 @inlined
+def wins(reach, other_reach, spread, other_spread, item, other):
+    """Whether an item reaches farther than another, or as far and spreads more, or has the lesser number."""
+    if reach != other_reach:
+        return reach > other_reach
+    if spread != other_spread:
+        return spread > other_spread
+    return item < other
+
+
+@inlined
 def lowest(boxes, items, axis, begin, end):
-    """The place of the item that begins first on an axis; of several that of the one that ends last, then of
-    the least item."""
+    """The place of the item that begins first on an axis; of several that of the one that ends last."""
     best = begin
     for place in range(begin + 1, end):
         one, two = items[axis, place], items[axis, best]
-        if boxes[one, axis] > boxes[two, axis]:
-            continue
-        if boxes[one, axis] < boxes[two, axis] or before(
-            boxes[one, axis + 3], boxes[two, axis + 3], one, two
-        ):
+        low, other_low = boxes[one, axis], boxes[two, axis]
+        if wins(-low, -other_low, boxes[one, axis + 3], boxes[two, axis + 3], one, two):
             best = place
     return best
 
 
 @inlined
 def highest(boxes, items, axis, begin, end, but):
-    """The place of the item that ends last on an axis, but for one place; of several as in `lowest`."""
+    """The place of the item that ends last on an axis, but for one place; of several: that begins first."""
     best = begin if but != begin else begin + 1
     for place in range(best + 1, end):
         one, two = items[axis, place], items[axis, best]
-        if place == but or boxes[one, axis + 3] < boxes[two, axis + 3]:
-            continue
-        if boxes[one, axis + 3] > boxes[two, axis + 3] or before(
-            boxes[two, axis], boxes[one, axis], one, two
-        ):
+        low, other_low = boxes[one, axis], boxes[two, axis]
+        if place != but and wins(boxes[one, axis + 3], boxes[two, axis + 3], -low, -other_low, one, two):
             best = place
     return best
-
-
-@inlined
-def before(larger, smaller, one, two):
-    """Whether an item reaches farther than another, or as far and comes first."""
-    return larger > smaller or (larger == smaller and one < two)
 
 
 @kernel

@@ -358,7 +358,7 @@ def rate_and_ratio(rays: int, seconds: np.ndarray, of_reference: np.ndarray) -> 
 
 
 def tell_no_one(_stage: str, _fraction: float) -> None:
-    pass
+    """The watch of who does not watch."""
 
 
 # Notes. Strip-RT's lead in primary / secondary rays a second and what a triangle takes, in blocks of 256:

@@ -4,8 +4,8 @@ Source: Eisemann, Bauszat, Guthe, Magnor, "Geometry Presorting for Implicit Obje
 2012), additional material, table 1 and figure 1: kilobytes (of 1000 bytes) of the first n levels as plain
 nodes, 5 to 16 levels. Differences:
 
-1. Beside the bytes stand tests and rays a second: of primary rays of one camera, and of one cosine-distributed
-   ray from each hit. The paper has them for no more than a few levels.
+1. Beside the bytes stand tests and rays a second: of primary rays of one camera, and of one
+   cosine-distributed ray from each hit.
 2. No level at all is a row too, and so is a whole SAH BVH: plain nodes down to two triangles, in the same
    walk. The default eight-wide SAH hierarchy over the same triangles stands beside them.
 3. The two ways to test a presorted node (`trace.walk_presorted`) are compared without levels, with ten, and
@@ -357,7 +357,7 @@ def _plot_memory(axes: "Axes", study: PresortedStudy) -> None:
 
 
 def _plot_curves(axes: "Axes", study: PresortedStudy, what: str, unit: float) -> None:
-    """A figure of each kind of rays by levels, with those of the whole SAH BVH and the default walk across."""
+    """A figure of each kind of rays by levels; across, those of the whole SAH BVH and the default walk."""
     whole = study.both_tests(EVERY_LEVEL)[0]
     rows = [row for row in study.by_levels if row is not whole]
     levels = [row.levels for row in rows if row.levels is not None]
