@@ -61,8 +61,10 @@ def top_nodes(size, boxes, levels, words, floats, starts):
 
 @kernel
 def plain_depth(words):
-    """The most nodes on a way down the plain nodes, (t, 8) uint32; a child that is none, or before its parent,
-    counts for nothing."""
+    """The most nodes on a way down plain nodes, (t, 8) uint32.
+
+    A child that is none, or stands before its parent, counts for nothing.
+    """
     depth = np.zeros(len(words), np.int64)
     most = 0
     for node in range(len(words)):
@@ -91,38 +93,37 @@ def left_share(count):
 
 
 @inlined
+def wins(reach, other_reach, spread, other_spread, item, other):
+    """Whether an item reaches farther than another, or as far and spreads more, or has the lesser number."""
+    if reach != other_reach:
+        return reach > other_reach
+    if spread != other_spread:
+        return spread > other_spread
+    return item < other
+
+
+@inlined
 def lowest(boxes, items, axis, begin, end):
-    """The place of the item that begins first on an axis; of several that of the one that ends last, then of
-    the least item."""
+    """The place of the item that begins first on an axis; of several that of the one that ends last."""
     best = begin
     for place in range(begin + 1, end):
         one, two = items[axis, place], items[axis, best]
-        if boxes[one, axis] > boxes[two, axis]:
-            continue
-        if boxes[one, axis] < boxes[two, axis] or before(boxes[one, axis + 3], boxes[two, axis + 3], one, two):
+        low, other_low = boxes[one, axis], boxes[two, axis]
+        if wins(-low, -other_low, boxes[one, axis + 3], boxes[two, axis + 3], one, two):
             best = place
     return best
 
 
 @inlined
 def highest(boxes, items, axis, begin, end, but):
-    """The place of the item that ends last on an axis, but for one place; of several as in `lowest`."""
+    """The place of the item that ends last on an axis, but for one place; of several: that begins first."""
     best = begin if but != begin else begin + 1
     for place in range(best + 1, end):
         one, two = items[axis, place], items[axis, best]
-        if place == but or boxes[one, axis + 3] < boxes[two, axis + 3]:
-            continue
-        if boxes[one, axis + 3] > boxes[two, axis + 3] or before(
-            boxes[two, axis], boxes[one, axis], one, two
-        ):
+        low, other_low = boxes[one, axis], boxes[two, axis]
+        if place != but and wins(boxes[one, axis + 3], boxes[two, axis + 3], -low, -other_low, one, two):
             best = place
     return best
-
-
-@inlined
-def before(larger, smaller, one, two):
-    """Whether an item reaches farther than another, or as far and comes first."""
-    return larger > smaller or (larger == smaller and one < two)
 
 
 @kernel
@@ -208,7 +209,7 @@ def sort_range(boxes, items, spare, side, order, base, begin, end, node, axis, g
 
 
 @kernel
-def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
+def sort_trees(boxes, items, spare, side, order, starts, first, last):
     """Sort the trees `first:last`, see `sort_range`.
 
     Args:
@@ -218,7 +219,6 @@ def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
         side: (n,) uint8, room, zeros.
         order: (n,) int32, written.
         starts: (r+1,) int32.
-        axes: (r,) int64, of the roots' slabs.
         first: The first tree.
         last: One more than the last.
     """
@@ -226,24 +226,23 @@ def sort_trees(boxes, items, spare, side, order, starts, axes, first, last):
     for tree in range(first, last):
         begin, end = np.int64(starts[tree]), np.int64(starts[tree + 1])
         sort_range(
-            boxes, items, spare, side, order, begin, begin, end, np.int64(0), axes[tree], np.int64(0), jobs
+            boxes, items, spare, side, order, begin, begin, end, np.int64(0), np.int64(0), np.int64(0), jobs
         )
 
 
 @kernel
-def first_spill(boxes, starts, axes):
+def first_spill(boxes, starts):
     """The first triangle of a node whose slab does not hold what is below it; -1 where there is none.
 
     Args:
         boxes: (n, 6) float32, of triangles in their places.
         starts: (r+1,) int32, rising from 0 to n.
-        axes: (r,) int64, of the roots' slabs.
     """
     longest = 0
-    for tree in range(len(axes)):
+    for tree in range(len(starts) - 1):
         longest = max(longest, starts[tree + 1] - starts[tree])
     span = np.empty(((longest + 1) // 2, 6), np.float32)
-    for tree in range(len(axes)):
+    for tree in range(len(starts) - 1):
         base = np.int64(starts[tree])
         count = starts[tree + 1] - base
         nodes = (count + 1) // 2
@@ -260,7 +259,7 @@ def first_spill(boxes, starts, axes):
             for k in range(3):
                 span[node, k] = min(boxes[place, k], boxes[also, k])
                 span[node, 3 + k] = max(boxes[place, 3 + k], boxes[also, 3 + k])
-            axis = (axes[tree] + depth) % 3
+            axis = depth % 3
             low, high = span[node, axis], span[node, 3 + axis]
             # Join what is below, and compare; a comparison with NaN says no.
             for child in range(2 * node + 1, min(2 * node + 3, nodes)):

@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from striptools.errors import LimitError
-from striptools.hierarchies.presorted import Presorted, root_axes, tree_boxes, tree_depth
+from striptools.hierarchies.presorted import Presorted, tree_depth
 from striptools.kernels.presorted import plain_depth
 from striptools.trace.box import MARGIN
 from striptools.trace.leaves import LeafBlocks, aligned_zeros, fill_blocks, reach_of, size_class
 from striptools.trace.single import SingleLayout, padded
 from striptools.trace.walk import WIDTH, Frame
 from striptools.trace.walk_presorted import DirectScene, PresortedScene
-from striptools.types import Boxes
 
 if TYPE_CHECKING:
     from striptools.reducem.placed import Placed
@@ -25,7 +24,7 @@ MOST_TRIANGLES = 2**26
 
 
 def lay_out_presorted(
-    scene: "Scene | Placed", hierarchy: Presorted, threads: int = 1, *, node_test: NodeTest = "direct"
+    scene: "Scene | Placed", hierarchy: Presorted, threads: int = 1, *, node_test: NodeTest = "bandwidth"
 ) -> SingleLayout:
     """Lay a scene out for the walk of its presorted hierarchy.
 
@@ -34,7 +33,7 @@ def lay_out_presorted(
     Args:
         scene: Whose triangles stand in the hierarchy's order.
         hierarchy: What stands above.
-        threads: To box triangles with.
+        threads: Not used: nothing is built.
         node_test: How nodes are tested, see `walk_presorted`.
 
     Raises:
@@ -44,9 +43,8 @@ def lay_out_presorted(
     if count >= MOST_TRIANGLES:
         where, remedy = "lay_out_presorted", "use another hierarchy"
         raise LimitError(f"{count} triangles", where=where, remedy=remedy)
-    boxes = scene.triangle_boxes(threads)
     held, faces = _hold(scene, count)
-    nodes = _nodes(hierarchy, boxes, held.scale)
+    nodes = _nodes(scene, hierarchy, held.scale)
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     frame = Frame(held.scale, reach_of(scene, held.scale), zero, one, MARGIN)
     kind = PresortedScene if node_test == "bandwidth" else DirectScene
@@ -69,16 +67,14 @@ def _hold(scene: "Scene | Placed", count: int) -> tuple[LeafBlocks, np.ndarray]:
     return LeafBlocks(lanes, place, filled.triangle_of, filled.scale), faces
 
 
-def _nodes(hierarchy: Presorted, triangle_boxes: Boxes, scale: np.float32) -> np.ndarray:
-    """Plain nodes as the walk reads them; one that is a leaf where the hierarchy has none."""
-    boxes = tree_boxes(hierarchy, triangle_boxes)
-    nodes, leaf = hierarchy.nodes, hierarchy.leaf_places
+def _nodes(scene: "Scene | Placed", hierarchy: Presorted, scale: np.float32) -> np.ndarray:
+    """Plain nodes as the walk reads them; a leaf over all triangles where the hierarchy has none."""
+    nodes = hierarchy.nodes
     if len(nodes) == 0:
-        nodes, leaf = np.zeros((1, 8), np.uint32), np.zeros(1, np.intp)
-        nodes[0, :6] = boxes[0].view(np.uint32)
+        nodes = np.zeros((1, 8), np.uint32)
+        nodes[0, :6] = np.concatenate([scene.low, scene.high]).astype(np.float32).view(np.uint32)
         nodes[0, 7] = hierarchy.starts[-1]
     nodes = padded(nodes)
-    nodes[leaf, 7] = 4 * nodes[leaf, 7] + root_axes(boxes)
     sides = nodes[:, :6].view(np.float32)
     sides *= scale
     return nodes

@@ -78,10 +78,8 @@ class Tracer:
         memory_budget: int | None = None,
     ) -> None:
         _check_kinds(hierarchy, resident)
-        devices = trace_devices(device, threads)
+        devices = self._choose(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
-        self._on_gpu = devices[0].platform != "cpu"
-        self._mesh = device_mesh(devices)
         if scene.instances is not None:
             resident, hierarchy = _of_instances(resident), "rebuilt"
         if scene.hierarchy is not None:
@@ -94,6 +92,25 @@ class Tracer:
         self._empty = scene.triangle_count == 0
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
+
+    @classmethod
+    def of_layout(
+        cls, layout: Layout, *, device: DeviceKind = "auto", threads: int | None = None
+    ) -> "Tracer":
+        """A tracer of what is laid out already, expanded: for studies of hierarchies that no scene holds."""
+        tracer = cls.__new__(cls)
+        tracer._choose(device, threads)
+        tracer._origin = np.zeros(3)
+        tracer._resident, tracer._empty = "expanded", False
+        tracer._take(layout)
+        return tracer
+
+    def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
+        """Take the devices to trace on."""
+        devices = trace_devices(device, threads)
+        self._on_gpu = devices[0].platform != "cpu"
+        self._mesh = device_mesh(devices)
+        return devices
 
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
         if scene.hierarchy is not None and hierarchy == "stored":

@@ -83,11 +83,10 @@ class Found(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """A presorted tree: its first triangle, the one after its last, and the axis of its root; () int32."""
+    """A presorted tree: its first triangle and the one after its last; () int32."""
 
     first: Array
     end: Array
-    axis: Array
 
 
 class Place(NamedTuple):
@@ -114,8 +113,7 @@ class PresortedScene(NamedTuple):
     Attributes:
         corners: (n', 3, 3) float32, scaled: triangle, axis, corner in the canonical order of the tests.
         faces: (n',) int32, the face that a hit on each triangle is reported as.
-        nodes: (t', 8) uint32, as `hierarchies.presorted.Presorted` has them but scaled, and of a leaf 4 times
-            the number of triangles + the axis of its root; at least one.
+        nodes: (t', 8) uint32, as `hierarchies.presorted.Presorted` has them but scaled; at least one.
         frame: How rays are seen.
     """
 
@@ -176,11 +174,10 @@ def _walk(scene: PresortedScene, ray: ReadyRay, stack: Array, options: WalkOptio
     def descend_then_sort_out(carried: tuple[Place, Array, Found]) -> tuple[Place, Array, Found]:
         place, stack, found = lax.while_loop(is_inner, lambda c: _visit_plain(scene, ray, *c), carried)
         leaf = place.node
-        below = Tree(_word(scene, leaf, 6), zero, _word(scene, leaf, 7) & 3)
-        below = below._replace(end=below.first + (_word(scene, leaf, 7) >> 2))
-        floor = place.height
-        at_leaf = in_reach(place, found) & (_word(scene, leaf, 7) != 0)
-        root = place._replace(node=jnp.where(at_leaf, below.first, NONE), axis=below.axis)
+        first, count = _word(scene, leaf, 6), _word(scene, leaf, 7)
+        below, floor = Tree(first, first + count), place.height
+        at_leaf = in_reach(place, found) & (count != 0)
+        root = place._replace(node=jnp.where(at_leaf, first, NONE), axis=zero)
         found = found.counting(_A_LEAF, at_leaf)
 
         def in_tree(carried: tuple[Place, Array, Found]) -> Array:
@@ -236,9 +233,9 @@ def _visit_presorted(
     found: Found,
 ) -> tuple[Place, Array, Found]:
     """Make a node's slab of the triangles it owns; where it is met, test them and go on to the children."""
-    own = lax.dynamic_slice(
-        scene.corners, (index(place.node), index(place.axis), jnp.uint32(0)), (2, 1, 3)
-    )[:, 0]
+    own = lax.dynamic_slice(scene.corners, (index(place.node), index(place.axis), jnp.uint32(0)), (2, 1, 3))[
+        :, 0
+    ]
     has_two = place.node + 1 < tree.end
     low_one, high_one = _extremes(own[0])
     low_two, high_two = _extremes(own[1])
