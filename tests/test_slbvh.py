@@ -77,7 +77,8 @@ def under(scene, over, balance, **limits):
 
 def slow_heap(boxes, balance, largest_leaf):
     """Nodes as a dict by number: (axis, leaf, count, first, box), and the order, by plain recursion."""
-    order, nodes = [], {}
+    order, nodes, codes = [], {}, None
+    depth = heap_depth(len(boxes), largest_leaf)
     wide = boxes.astype(np.float64)
     centre = wide[:, :3] + wide[:, 3:]
     if balance == "morton":
@@ -101,6 +102,12 @@ def slow_heap(boxes, balance, largest_leaf):
             order.extend(lists[0])
             return
         middle = (count + 1) // 2
+        if codes is not None:
+            bits = [f"{codes[item]:064b}" for item in lists[0]]
+            ones = [sum(bit == "1" for bit in column) for column in zip(*bits, strict=True)]
+            room = largest_leaf << (depth - node.bit_length())
+            changes = [count - each for each in ones if 0 < each < count]
+            middle = int(np.clip(changes[0], count - room, room)) if changes else middle
         extents = [centre[items[-1], axis] - centre[items[0], axis] for axis, items in enumerate(lists)]
         costs = [(cost(items, middle), -extents[axis], axis) for axis, items in enumerate(lists)]
         chosen = min(costs)[2]

@@ -26,24 +26,52 @@ def count_of(words, node):
     return np.int64(words[node, PRIM_COUNT]) >> COUNT_SHIFT
 
 
+@inlined
+def place_of_change(codes, begin, end):
+    """The first place of a range whose code has the highest bit in which its codes differ; -1 for none."""
+    differing = codes[begin] ^ codes[end - 1]
+    if differing == 0:
+        return np.int64(-1)
+    bit = np.uint64(1)
+    while differing > np.uint64(1):
+        differing >>= np.uint64(1)
+        bit <<= np.uint64(1)
+    without, having = begin, end - 1
+    while having - without > 1:
+        middle = (without + having) // 2
+        if codes[middle] & bit != 0:
+            having = middle
+        else:
+            without = middle
+    return having
+
+
 @kernel
-def fill_ranges(count, largest_leaf, words):
-    """Give each node of a heap of zeros its objects: halves by count, the left one the larger.
+def fill_ranges(count, codes, largest_leaf, words):
+    """Give each node of a heap of zeros its objects.
 
     Args:
         count: Objects.
-        largest_leaf: A node of at most that many is a leaf; the last level has no larger ones.
+        codes: (count,) uint64, rising: nodes are split where the highest bit changes, or as near to there as
+            leaves room in the levels below; without an entry they are halved, the left half the larger.
+        largest_leaf: A node of at most that many is a leaf; the heap has room for `count` objects.
         words: (2**d, 8) uint32, written.
     """
     words[1, PRIM_COUNT] = count << COUNT_SHIFT
+    room = np.int64(largest_leaf) * (len(words) // 2)
     for node in range(1, len(words)):
+        # Each level has room for half as many objects a node as the one above.
+        room = room // 2 if node & (node - 1) == 0 else room
         total = count_of(words, node)
         if 0 < total <= largest_leaf:
             words[node, PRIM_COUNT] |= np.uint32(LEAF)
         elif total > 0:
-            # Hand the first half to the left child and the rest to the right one.
             first = np.int64(words[node, PRIM_POS])
             left = (total + 1) // 2
+            if len(codes) > 0:
+                change = place_of_change(codes, first, first + total)
+                left = min(max(change - first, total - room), room) if change >= 0 else left
+            # Hand the first part to the left child and the rest to the right one.
             words[2 * node, PRIM_COUNT] = left << COUNT_SHIFT
             words[2 * node, PRIM_POS] = first
             words[2 * node + 1, PRIM_COUNT] = (total - left) << COUNT_SHIFT

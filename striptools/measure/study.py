@@ -287,10 +287,10 @@ def _steps(
 
 
 def timed_in_turn(
-    tracers: dict[str, Tracer], rays: tuple[RaySet, RaySet], runs: int, tell: Watch
+    tracers: dict[str, Tracer], rays: tuple[RaySet, ...], runs: int, tell: Watch
 ) -> dict[str, np.ndarray]:
-    """(runs, 2) seconds of each variant, for primary and secondary rays; all in turn within each run."""
-    times = {name: np.zeros((runs, 2)) for name in tracers}
+    """(runs, k) seconds of each variant, for k kinds of rays; all in turn within each run."""
+    times = {name: np.zeros((runs, len(rays))) for name in tracers}
     names = list(tracers)
     # The first run compiles and warms up, and does not count.
     for run in range(-1, runs):
