@@ -167,7 +167,14 @@ class Study:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class StudyRays:
+    """Rays of one kind.
+
+    Attributes:
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+    """
+
     origins: RayVectors
     directions: RayVectors
 
@@ -216,9 +223,9 @@ def study_strips(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watc
     tracers = {
         name: Tracer(scene, device=options.device, threads=options.threads) for name, scene in scenes.items()
     }
-    rays = _rays(scenes[REFERENCE], tracers[REFERENCE], options)
+    rays = study_rays(scenes[REFERENCE], tracers[REFERENCE], options)
     steps = _steps(tracers, rays, tell)
-    times = _times(tracers, rays, options.runs, tell)
+    times = study_times(tracers, rays, options.runs, tell)
     quality = _qualities(scenes, options.options)
     rows = [
         _row(name, orderings[name], scenes[name], seconds[name], times, steps[name], quality[name], rays)
@@ -255,7 +262,7 @@ def _bytes(scene: Scene) -> int:
     return sum(parts.values()) - parts["remap"] - parts["attributes"]
 
 
-def _rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[_Rays, _Rays]:
+def study_rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[StudyRays, StudyRays]:
     """Primary rays of one camera, and a secondary one from each of their hits, towards its side."""
     camera = Camera.framing(scene.positions, width=options.side, height=options.side, up=options.up)
     origins, directions = camera_rays(camera)
@@ -270,11 +277,11 @@ def _rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[_Rays, _
     normals *= np.where((normals * way).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)
     diagonal = float(np.linalg.norm(np.ptp(scene.positions.astype(np.float64), axis=0)))
     offset = LIFT * diagonal + 2.0**-20 * np.abs(points).max(axis=1, initial=0.0)
-    return _Rays(origins, directions), _Rays(*cosine_rays(points, normals, offset=offset))
+    return StudyRays(origins, directions), StudyRays(*cosine_rays(points, normals, offset=offset))
 
 
 def _steps(
-    tracers: dict[str, Tracer], rays: tuple[_Rays, _Rays], tell: Watch
+    tracers: dict[str, Tracer], rays: tuple[StudyRays, StudyRays], tell: Watch
 ) -> dict[str, tuple[float, float]]:
     found = {}
     for done, (name, tracer) in enumerate(tracers.items()):
@@ -284,8 +291,8 @@ def _steps(
     return found
 
 
-def _times(
-    tracers: dict[str, Tracer], rays: tuple[_Rays, _Rays], runs: int, tell: Watch
+def study_times(
+    tracers: dict[str, Tracer], rays: tuple[StudyRays, StudyRays], runs: int, tell: Watch
 ) -> dict[str, np.ndarray]:
     """(runs, 2) seconds of each variant, for primary and secondary rays; all in turn within each run."""
     times = {name: np.zeros((runs, 2)) for name in tracers}
@@ -303,7 +310,7 @@ def _times(
     return times
 
 
-def _seconds(tracer: Tracer, rays: _Rays, part: slice) -> float:
+def _seconds(tracer: Tracer, rays: StudyRays, part: slice) -> float:
     start = time.perf_counter()
     tracer.closest_hit(rays.origins[part], rays.directions[part])
     return time.perf_counter() - start
@@ -325,7 +332,7 @@ def _row(
     times: dict[str, np.ndarray],
     steps: tuple[float, float],
     quality: StripQuality,
-    rays: tuple[_Rays, _Rays],
+    rays: tuple[StudyRays, StudyRays],
 ) -> StudyRow:
     primary, secondary = (
         _rate_and_ratio(len(part.origins), times[name][:, kind], times[REFERENCE][:, kind])
