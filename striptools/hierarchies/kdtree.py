@@ -34,7 +34,7 @@ from striptools.errors import LimitError, UnreadableSceneError, UsageError
 from striptools.hierarchies.options import HierarchyOptions, OverName
 from striptools.kernels import kdtree as kernels
 from striptools.partition.object_split import check_boxes
-from striptools.partition.sah import KdCosts
+from striptools.partition.sah import KD_STRIP_COST, KdCosts
 from striptools.types import Boxes
 
 __all__ = ["MAILBOX", "KdTree", "build_kdtree", "check_kdtree"]
@@ -100,7 +100,7 @@ def build_kdtree(
         threads: How many threads share the work; the tree is the same for any number.
         corners: (p, 3, 3) float32 where the objects are triangles, which are then clipped to cells; None
             where it is their boxes that are.
-        constants: Of the cost model; the defaults of KdCosts when left out.
+        constants: Of the cost model; what suits the objects when left out.
 
     Returns:
         The tree, for which `check_kdtree` holds.
@@ -109,7 +109,8 @@ def build_kdtree(
         UsageError: No object, boxes that are not finite or inverted, or corners of other objects.
         LimitError: More than MOST_REFERENCES objects, or references to them.
     """
-    constants = constants or KdCosts()
+    if constants is None:
+        constants = KdCosts(intersection=KD_STRIP_COST) if options.objects == "strips" else KdCosts()
     check_boxes(boxes)
     corners = _checked_corners(boxes, corners)
     _check_most(len(boxes))
