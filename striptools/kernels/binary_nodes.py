@@ -227,3 +227,22 @@ def first_flaw(nodes, corners, order, boxes):
             if waiting[height] != node + 1:
                 return NO_PREORDER, node
     return 0, deepest
+
+
+@kernel
+def depth_of(nodes):
+    """The most inner nodes above a leaf, of nodes without a flaw."""
+    above = np.empty(STACK, np.int64)
+    height = 0
+    depth = 0
+    deepest = 0
+    for node in range(nodes.shape[0]):
+        if nodes[node, 7] == 0:
+            depth += 1
+            above[height] = depth
+            height += 1
+            deepest = max(deepest, depth)
+        elif height > 0:
+            height -= 1
+            depth = above[height]
+    return deepest

@@ -1,7 +1,8 @@
 """Kernels of the loose octree: where an object belongs, the keys that sort objects, and the sweep over them.
 
-Where an object belongs is one word of 64 bits: the Morton code of its cell, then a 1, then zeros. So the
-lowest bit that is set tells the level, and what is above it is twice the adjusted Morton code m'.
+Where an object belongs is one word of 64 bits. The high 49 say the cell: its Morton code, then a 1, then
+zeros; so the lowest bit that is set tells the level l, and what is above it is twice the adjusted code m'.
+The low 15 are the next bits of the Morton code of the object's centre, finer than the cell.
 """
 
 import numpy as np
@@ -10,35 +11,34 @@ from striptools.kernels.binary_nodes import STACK, join_two, new_forest, put_lea
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.morton import MOST_BITS, spread_bits
 
-LEVELS = 3 * MOST_BITS
-"""Binary levels below the root: three to a level of the octree."""
+MOST_HALVINGS = 16
+LEVELS = 3 * MOST_HALVINGS
+"""Binary levels below the root, three to a level of the octree."""
 
+FINER_BITS = 3 * MOST_BITS - LEVELS
+FINER = np.uint64((1 << FINER_BITS) - 1)
+"""At the deepest level the finer bits complete the Morton code of 63 bits."""
+
+SAME_CELL = np.int64(1) << 62
 ONE = np.uint64(1)
 
 
 @kernel
-def bounds_of_boxes(boxes, begin, end, bounds):
-    """Fill bounds (6,) with those of the boxes `begin:end`; False where a box is not finite, or inverted."""
-    low_x = low_y = low_z = np.float32(np.inf)
-    high_x = high_y = high_z = np.float32(-np.inf)
+def bounds_of_boxes(boxes, begin, end):
+    """The bounds of the boxes `begin:end`, (6,) float32, or NaN where a box is not finite or inverted."""
+    bounds = np.full(6, -np.inf, np.float32)
     sound = True
     for item in range(begin, end):
-        low_x, low_y, low_z = (
-            min(low_x, boxes[item, 0]),
-            min(low_y, boxes[item, 1]),
-            min(low_z, boxes[item, 2]),
-        )
-        high_x, high_y, high_z = (
-            max(high_x, boxes[item, 3]),
-            max(high_y, boxes[item, 4]),
-            max(high_z, boxes[item, 5]),
-        )
         for axis in range(3):
             low, high = boxes[item, axis], boxes[item, axis + 3]
-            sound &= low <= high and high - high == 0 and low - low == 0
-    bounds[0], bounds[1], bounds[2] = low_x, low_y, low_z
-    bounds[3], bounds[4], bounds[5] = high_x, high_y, high_z
-    return sound
+            sound &= -np.inf < low <= high < np.inf
+            bounds[axis] = max(bounds[axis], -low)
+            bounds[axis + 3] = max(bounds[axis + 3], high)
+    for axis in range(3):
+        bounds[axis] = -bounds[axis]
+    if not sound:
+        bounds[:] = np.nan
+    return bounds
 
 
 @inlined
@@ -64,20 +64,35 @@ def below_highest(x):
 @inlined
 def cell_at(place, low, scale):
     """Which of 2**21 cells a place is in; places outside are in the nearest."""
-    cell = (place - low) * scale
     last = np.float64((1 << MOST_BITS) - 1)
-    return np.int64(min(max(cell, 0.0), last))
+    return np.int64(min(max((place - low) * scale, 0.0), last))
 
 
 @inlined
-def fits(box_low, box_high, low, cell, size):
-    """Whether a loose cell holds an object on an axis: half a cell more on either side."""
-    return box_low >= low + (cell - 0.5) * size and box_high <= low + (cell + 1.5) * size
+def halvings(box_low, box_high, low, size, place):
+    """How often the root's cell may be halved on an axis so that, made loose, it holds an object.
+
+    A loose cell is half a cell larger on either side. `place` is the finest cell of the object's centre.
+    """
+    # A cell as large as the object holds it, wherever in the cell its centre is.
+    extent = box_high - box_low
+    count = np.int64(0)
+    cell = size * 0.5
+    while cell >= extent and count < MOST_HALVINGS:
+        count += 1
+        cell *= 0.5
+
+    # One of half that side may, and none of a quarter does.
+    if count < MOST_HALVINGS:
+        corner = low + np.float64(place >> (MOST_BITS - 1 - count)) * cell
+        if box_low >= corner - 0.5 * cell and box_high <= corner + 1.5 * cell:
+            count += 1
+    return count
 
 
 @kernel
 def place_words(boxes, begin, end, low, size, by_extent, words):
-    """Say where the objects `begin:end` belong, and give the bits in which their words differ from none.
+    """Say where the objects `begin:end` belong.
 
     Args:
         boxes: (p, 6) float32, finite.
@@ -85,77 +100,61 @@ def place_words(boxes, begin, end, low, size, by_extent, words):
         end: The one behind the last.
         low: (3,) float64, the low corner of the root's cell.
         size: Its side, > 0.
-        by_extent: Whether an object goes to the finest cell that holds it when loose; else to the finest.
+        by_extent: Whether an object goes to the finest cell that holds it when loose; else all go to the
+            finest there are.
         words: (p,) uint64 to fill.
 
     Returns:
-        All words joined by or.
+        The cells of all words, joined by or.
     """
     scale = (1 << MOST_BITS) / size
     seen = np.uint64(0)
     for item in range(begin, end):
-        low_x, low_y, low_z = (
-            np.float64(boxes[item, 0]),
-            np.float64(boxes[item, 1]),
-            np.float64(boxes[item, 2]),
-        )
-        high_x, high_y, high_z = (
-            np.float64(boxes[item, 3]),
-            np.float64(boxes[item, 4]),
-            np.float64(boxes[item, 5]),
-        )
+        low_x, high_x = np.float64(boxes[item, 0]), np.float64(boxes[item, 3])
+        low_y, high_y = np.float64(boxes[item, 1]), np.float64(boxes[item, 4])
+        low_z, high_z = np.float64(boxes[item, 2]), np.float64(boxes[item, 5])
         x = cell_at((low_x + high_x) * 0.5, low[0], scale)
         y = cell_at((low_y + high_y) * 0.5, low[1], scale)
         z = cell_at((low_z + high_z) * 0.5, low[2], scale)
-        level = np.int64(MOST_BITS)
+        level = np.int64(LEVELS)
         if by_extent:
-            # A cell as large as the object holds it, wherever in the cell its centre is.
-            extent = max(max(high_x - low_x, high_y - low_y), high_z - low_z)
-            cell = size * 2.0**-MOST_BITS
-            while cell < extent and level > 0:
-                level -= 1
-                cell *= 2.0
+            # Binary levels halve x, then y, then z.
+            on_x = halvings(low_x, high_x, low[0], size, x)
+            on_y = halvings(low_y, high_y, low[1], size, y)
+            on_z = halvings(low_z, high_z, low[2], size, z)
+            level = min(min(min(3 * on_x, 3 * on_y + 1), 3 * on_z + 2), level)
+        code = spread_bits(np.uint64(x)) << np.uint64(2)
+        code |= spread_bits(np.uint64(y)) << ONE
+        code |= spread_bits(np.uint64(z))
 
-            # One of half that side may, and none of a quarter does.
-            if level < MOST_BITS:
-                finer = np.int64(MOST_BITS - 1) - level
-                cell *= 0.5
-                if (
-                    fits(low_x, high_x, low[0], x >> finer, cell)
-                    and fits(low_y, high_y, low[1], y >> finer, cell)
-                    and fits(low_z, high_z, low[2], z >> finer, cell)
-                ):
-                    level += 1
-        code = (
-            (spread_bits(np.uint64(x)) << np.uint64(2))
-            | (spread_bits(np.uint64(y)) << ONE)
-            | spread_bits(np.uint64(z))
-        )
-        mark = ONE << np.uint64(LEVELS - 3 * level)
-        word = ((code << ONE) & ~((mark << ONE) - ONE)) | mark
-        words[item] = word
-        seen |= word
+        # Put together the cell's code, a 1, zeros, and the next bits of the centre's code.
+        finer_bits = (code >> np.uint64(LEVELS - level)) & FINER
+        mark = ONE << np.uint64(LEVELS - level)
+        cell = (code >> np.uint64(FINER_BITS - 1)) & ~((mark << ONE) - ONE)
+        words[item] = ((cell | mark) << np.uint64(FINER_BITS)) | finer_bits
+        seen |= cell | mark
     return seen
 
 
 @kernel
 def depth_first_keys(words, begin, end, spare, deepest, keys):
-    """Give the words `begin:end` the levels that are in use, and the keys of the depth-first order.
+    """Leave out of the words `begin:end` the levels that no object is at, and give their keys.
 
     Args:
-        words: (p,) uint64, shifted down by `spare`.
+        words: (p,) uint64, of which the cells are shifted down by `spare`.
         begin: The first object.
         end: The one behind the last.
-        spare: Levels that no object is at, below the deepest one in use.
+        spare: Levels below the deepest one in use.
         deepest: That level, L'.
-        keys: (p,) uint64 to fill: l - popc(m') + 2 m'.
+        keys: (p,) uint64 to fill: k = l - popc(m') + 2 m', then the finer bits of the centre.
     """
     for item in range(begin, end):
-        word = words[item] >> np.uint64(spare)
-        words[item] = word
-        twice = word & (word - ONE)
-        level = np.uint64(deepest) - ones_in(~word & (word - ONE))
-        keys[item] = level - ones_in(twice) + twice
+        finer = words[item] & FINER
+        cell = words[item] >> np.uint64(FINER_BITS + spare)
+        twice = cell & (cell - ONE)
+        level = np.uint64(deepest) - ones_in(~cell & (cell - ONE))
+        words[item] = (cell << np.uint64(FINER_BITS)) | finer
+        keys[item] = ((level - ones_in(twice) + twice) << np.uint64(FINER_BITS)) | finer
 
 
 @inlined
@@ -163,11 +162,16 @@ def apart(one, one_place, other, other_place):
     """How far two objects are from a common cell: smaller where theta(one, other) is larger.
 
     The bits from the highest one down that m' of both differ in or, where that is more, those below the
-    other's level. Of objects in the same cell those are the closer ones whose places share more high bits,
-    and all are closer than any two in different cells.
+    other's level. Objects in the same cell are closer than any two that are not: by the finer bits of their
+    centres, then by their places.
     """
-    if one == other:
-        return np.int64(below_highest(np.uint64(one_place ^ other_place))) - (np.int64(1) << 32)
+    differ = one ^ other
+    if differ == 0:
+        return np.int64(below_highest(np.uint64(one_place ^ other_place))) - SAME_CELL
+    if differ <= FINER:
+        return (np.int64(below_highest(differ)) << 32) - SAME_CELL
+    one >>= np.uint64(FINER_BITS)
+    other >>= np.uint64(FINER_BITS)
     differ = (one & (one - ONE)) ^ (other & (other - ONE))
     return np.int64((below_highest(differ) >> ONE) | (~other & (other - ONE)))
 
