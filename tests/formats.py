@@ -131,7 +131,8 @@ def assert_same_hierarchy(hierarchy, decoded) -> None:
     items = items_of(hierarchy)
     assert ([] if items is None else items.tolist()) == decoded.items
     if decoded.kind == 2:
-        assert np.concatenate([hierarchy.low, hierarchy.high]).view(np.uint32).tolist() == list(decoded.bounds)
+        bounds = np.concatenate([hierarchy.low, hierarchy.high])
+        assert bounds.view(np.uint32).tolist() == list(decoded.bounds)
 
 
 def assert_same_places(scene, decoded) -> None:

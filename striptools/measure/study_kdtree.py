@@ -20,7 +20,7 @@ import numpy as np
 
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
-from striptools.measure.plots import require_plots, write_figure
+from striptools.measure.plots import require_plots, save_figure
 from striptools.measure.study import StudyOptions, RaySet, study_rays, timed_in_turn
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
@@ -283,4 +283,4 @@ def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int
     panels[1].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
     name = f"{title}: " if title else ""
     figure.suptitle(f"{name}kd-trees by the plain and by the corrected surface area metric")
-    return write_figure(figure, target)
+    return save_figure(figure, target)
