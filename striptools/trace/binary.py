@@ -20,9 +20,7 @@ def lay_out_loose(scene: "Scene", hierarchy: LooseBvh, _threads: int = 1) -> Sin
     return lay_out_binary(scene, hierarchy.nodes, hierarchy.order, hierarchy.over)
 
 
-def lay_out_binary(
-    scene: "Scene", nodes: np.ndarray, order: Counts | None, over: OverName
-) -> SingleLayout:
+def lay_out_binary(scene: "Scene", nodes: np.ndarray, order: Counts | None, over: OverName) -> SingleLayout:
     """Lay a scene out for the walk through any binary hierarchy.
 
     Args:

@@ -29,7 +29,6 @@ from striptools.trace.walk_single import (
 )
 
 NODE_BYTES = 64
-BOX_BYTES = 32
 
 
 class BinaryScene(NamedTuple):
@@ -98,7 +97,7 @@ def _walk(scene: BinaryScene, ray: ReadyRay, stack: Array, options: WalkOptions)
     start = _Place(ray.start.child, jnp.int32(0), stack, jnp.int32(0))
     place, best, counted = lax.while_loop(goes_on, down_then_leaf, (start, nothing_yet(ray), no_counts()))
     turns = place.turns
-    counted = counted._replace(nodes=turns, boxes=2 * turns + 1, node_bytes=NODE_BYTES * turns + BOX_BYTES)
+    counted = counted._replace(nodes=turns, boxes=2 * turns + 1, node_bytes=NODE_BYTES * turns)
     return place.stack, Ended(best, counted, place.child != DONE)
 
 
