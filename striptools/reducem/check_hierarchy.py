@@ -22,7 +22,7 @@ from striptools.types import Boxes, Counts
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
-__all__ = ["check_hierarchy"]
+__all__ = ["check_hierarchy", "hierarchy_depth"]
 
 CHUNK = 1 << 20
 """Triangles of references that are looked at together."""
@@ -58,6 +58,28 @@ def check_hierarchy(scene: "Scene", hierarchy: StoredHierarchy, where: str) -> N
     if isinstance(hierarchy, Slbvh):
         return _check_heap(hierarchy.nodes, boxes, place)
     return _check_preorder(hierarchy.nodes, boxes, place)
+
+
+def hierarchy_depth(hierarchy: StoredHierarchy) -> int:
+    """The nodes on the longest way down a sound hierarchy, those of presorted trees among them."""
+    nodes = hierarchy.nodes
+    if isinstance(hierarchy, Slbvh):
+        return int(np.flatnonzero(nodes.any(axis=1))[-1]).bit_length()
+    if isinstance(hierarchy, Presorted):
+        below = np.frexp(((np.diff(hierarchy.starts) + 1) // 2).astype(np.float64))[1]
+        if len(nodes) == 0:
+            return int(below[0])
+        tree, leaves = _preorder(nodes, "HIER")
+        depth = np.zeros(len(nodes), np.int64)
+        for number, level in enumerate(tree.levels, 1):
+            depth[level] = number
+        return int((depth[leaves] + below).max())
+    if isinstance(hierarchy, KdTree):
+        is_inner, second = nodes[:, 1] & 3 != KD_LEAF, nodes[:, 1] >> 2
+    else:
+        is_inner, second = nodes[:, 7] == 0, nodes[:, 6]
+    left = np.where(is_inner, np.arange(1, len(nodes) + 1), -1)
+    return len(_tree(left, np.where(is_inner, second.astype(np.int64), -1), 0, "HIER").levels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,26 +240,19 @@ def _check_presorted(scene: "Scene", hierarchy: Presorted, place: str) -> None:
     if starts[0] != 0 or starts[-1] != scene.triangle_count or (np.diff(starts) < 1).any():
         raise unreadable("RDM567", place)
     boxes = scene.triangle_boxes()
-    trees = range_boxes(boxes, starts.astype(np.int32))
+    _check_slabs(boxes, starts, place)
     if len(nodes) == 0:
-        _check_slabs(boxes, starts, _root_axes(trees), place)
         return
     tree, leaves = _preorder(nodes, place)
     first, held = nodes[leaves, 6].astype(np.int64), nodes[leaves, 7].astype(np.int64)
     if not (np.array_equal(first, starts[:-1]) and np.array_equal(held, np.diff(starts))):
         raise unreadable("RDM566", place)
-    _check_slabs(boxes, starts, _root_axes(nodes[leaves, :6].view(np.float32)), place)
     contents = np.zeros((len(nodes), 6), np.float32)
-    contents[leaves] = trees
+    contents[leaves] = range_boxes(boxes, starts.astype(np.int32))
     _check_boxes(nodes, np.arange(len(nodes)), tree.contents(contents), place)
 
 
-def _root_axes(boxes: Boxes) -> np.ndarray:
-    """The axis of the root of each tree: the one before the longest side of its box."""
-    return (np.argmax(boxes[:, 3:].astype(np.float64) - boxes[:, :3], axis=1) + 2) % 3
-
-
-def _check_slabs(boxes: Boxes, starts: Counts, axes: np.ndarray, place: str) -> None:
+def _check_slabs(boxes: Boxes, starts: Counts, place: str) -> None:
     """Make sure that the two triangles of each node span all below it on the node's axis."""
     sizes = np.diff(starts)
     counts = (sizes + 1) // 2
@@ -254,7 +269,7 @@ def _check_slabs(boxes: Boxes, starts: Counts, axes: np.ndarray, place: str) -> 
         for child in (level[number[level] % 2 == 1], level[number[level] % 2 == 0]):
             parent = begin[tree[child]] + (number[child] - 1) // 2
             below[parent] = _union(below[parent], below[child])
-    rows, axis = np.arange(len(own)), (axes[tree] + depth) % 3
+    rows, axis = np.arange(len(own)), depth % 3
     wrong = (own[rows, axis] > below[rows, axis]) | (own[rows, axis + 3] < below[rows, axis + 3])
     if wrong.any():
         raise unreadable("RDM568", f"{place}: triangle {pairs[np.flatnonzero(wrong)[0]]}")

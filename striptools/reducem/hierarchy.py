@@ -29,10 +29,18 @@ def scene_under(scene: Scene, options: HierarchyOptions, threads: int) -> Scene:
     if (options.name == "reducem" and scene.hierarchy is None) or scene.triangle_count == 0:
         return scene
     _refuse(scene, options)
+    scene = replace(scene, metadata={**scene.metadata, "hierarchy": told(options)})
     if options.name == "presorted":
         return _presorted(scene, options, threads)
     none = PackedNodes(np.zeros((0, 16), np.uint32), 0, None, None, 0)
     return replace(scene, packed=none, hierarchy=_built(scene, options, threads))
+
+
+def told(options: HierarchyOptions) -> str:
+    """What was asked for, for the metadata: a reader can see what stands there, but not why."""
+    parts = {"slbvh": f", balance {options.balance}", "kdtree": f", metric {options.metric}"}
+    parts["presorted"] = f", levels {options.levels}"
+    return f"{options.name} over {options.objects}{parts.get(options.name, '')}"
 
 
 def _refuse(scene: Scene, options: HierarchyOptions) -> None:

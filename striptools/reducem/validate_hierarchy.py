@@ -275,9 +275,9 @@ def _presorted(look: _Look, geometry: Geometry) -> None:
     wrong[0] |= starts[0] != 0
     if look.found("RDM567", wrong, "item"):
         return None
-    boxes = _ranges(geometry.low, geometry.high, starts)
+    _slabs(look, geometry)
     if len(look.nodes) == 0:
-        return _slabs(look, geometry, boxes)
+        return None
     is_inner = look.nodes["b"] == 0
     word = _word(look, is_inner, look.nodes["a"].astype(np.int64))
     if word is None:
@@ -286,19 +286,13 @@ def _presorted(look: _Look, geometry: Geometry) -> None:
     told = np.stack([look.nodes["a"][leaves], look.nodes["b"][leaves]], axis=1).astype(np.int64)
     if len(leaves) != len(starts) - 1 or (told != np.stack([starts[:-1], np.diff(starts)], axis=1)).any():
         return look.refuse("RDM566")
-    _held(look, _below(word, leaves, boxes), np.ones(len(look.nodes), np.bool_))
-    outer = np.concatenate([look.nodes["low"][leaves], look.nodes["high"][leaves]], axis=1)
-    return _slabs(look, geometry, outer)
+    boxes = _ranges(geometry.low, geometry.high, starts)
+    return _held(look, _below(word, leaves, boxes), np.ones(len(look.nodes), np.bool_))
 
 
-def _slabs(look: _Look, geometry: Geometry, boxes: np.ndarray) -> None:
-    """Look whether each triangle lies in the slabs of all nodes above it; `boxes` are those of trees."""
+def _slabs(look: _Look, geometry: Geometry) -> None:
+    """Look whether each triangle lies in the slabs of all nodes above it."""
     starts, n = look.items, len(geometry.begins)
-    long = boxes[:, 3:].astype(np.float64) - boxes[:, :3]
-    # Of equal sides the first counts.
-    root = np.where(
-        long[:, 0] >= np.maximum(long[:, 1], long[:, 2]), 2, np.where(long[:, 1] >= long[:, 2], 0, 1)
-    )
     tree = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     begin, last = starts[tree], starts[tree + 1] - 1
     node = (np.arange(n) - begin) // 2
@@ -306,7 +300,7 @@ def _slabs(look: _Look, geometry: Geometry, boxes: np.ndarray) -> None:
     wrong = np.zeros(n, np.bool_)
     rows = np.arange(n)
     while len(rows):
-        axis = (root[tree[rows]] + depth[rows]) % 3
+        axis = depth[rows] % 3
         one = begin[rows] + 2 * node[rows]
         other = np.minimum(one + 1, last[rows])
         low = np.minimum(geometry.low[one, axis], geometry.low[other, axis])

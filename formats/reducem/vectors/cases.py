@@ -1413,7 +1413,7 @@ def presorted(blocks: list[Block], sizes: list[int] | None = None, **fields) -> 
     starts = [sum((sizes or [len(boxes)])[:i]) for i in range(len(sizes or [0]) + 1)]
     parts = [range(a, b) for a, b in pairwise(starts)]
     trees = [around([boxes[i] for i in part]) for part in parts]
-    orders = [presort([boxes[i] for i in part], box) for part, box in zip(parts, trees, strict=True)]
+    orders = [presort([boxes[i] for i in part]) for part in parts]
     order = [part[i] for part, row in zip(parts, orders, strict=True) for i in row]
     nodes = loose_tree(trees) if sizes else []
     nodes = [node if node[7] == 0 else (*node[:6], starts[node[6]], len(parts[node[6]])) for node in nodes]

@@ -650,9 +650,8 @@ def cell_tree(boxes: list[Box], depth: int) -> tuple[list[tuple], list[int], Box
     return nodes, references, root
 
 
-def presort(boxes: list[Box], root: Box) -> list[int]:
-    """The order in which triangles with these boxes are one presorted tree whose box is `root`."""
-    sides = [root[axis + 3] - root[axis] for axis in range(3)]
+def presort(boxes: list[Box]) -> list[int]:
+    """The order in which triangles with these boxes are one presorted tree."""
     count, order = -(-len(boxes) // 2), [-1] * len(boxes)
 
     def held(node: int) -> int:
@@ -672,7 +671,7 @@ def presort(boxes: list[Box], root: Box) -> list[int]:
         place(2 * node + 1, rest[:middle], (axis + 1) % 3)
         place(2 * node + 2, rest[middle:], (axis + 1) % 3)
 
-    place(0, list(range(len(boxes))), (sides.index(max(sides)) + 2) % 3)
+    place(0, list(range(len(boxes))), 0)
     return order
 
 
