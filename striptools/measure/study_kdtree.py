@@ -21,7 +21,7 @@ import numpy as np
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
 from striptools.measure.plots import require_plots, save_figure
-from striptools.measure.study import StudyOptions, RaySet, study_rays, timed_in_turn
+from striptools.measure.study import RaySet, StudyOptions, study_rays, timed_in_turn
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert

@@ -22,7 +22,7 @@ from striptools.types import Boxes, Counts
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
-__all__ = ["check_hierarchy", "hierarchy_depth"]
+__all__ = ["cells_of", "check_hierarchy", "hierarchy_depth"]
 
 CHUNK = 1 << 20
 """Triangles of references that are looked at together."""
@@ -300,6 +300,15 @@ def _check_cells(scene: "Scene", hierarchy: KdTree, objects: Counts, place: str)
         raise unreadable("RDM568", f"{place}: node 0")
     cells = _cells(tree, nodes, axis, root, place)
     _check_corners(scene, objects, cells[leaves][leaf], references, place)
+
+
+def cells_of(hierarchy: KdTree) -> Boxes:
+    """The cell of each node of a sound kd-tree, (m, 6) float32."""
+    nodes = hierarchy.nodes
+    axis = nodes[:, 1] & 3
+    right = np.where(axis != KD_LEAF, (nodes[:, 1] >> 2).astype(np.int64), -1)
+    tree = _tree(np.where(axis != KD_LEAF, np.arange(1, len(nodes) + 1), -1), right, 0, "HIER")
+    return _cells(tree, nodes, axis, np.concatenate([hierarchy.low, hierarchy.high]), "HIER")
 
 
 def _cells(tree: _Tree, nodes: np.ndarray, axes: np.ndarray, root: np.ndarray, place: str) -> Boxes:
