@@ -109,7 +109,8 @@ def test_noise_is_refused(noise):
 
 
 @pytest.mark.parametrize(
-    "kind", ["nodes_huge", "blocks_huge", "sections_many", "packed_bomb", "metadata_very_deep"]
+    "kind",
+    ["nodes_huge", "blocks_huge", "sections_many", "packed_bomb", "metadata_very_deep", "hierarchy_huge"],
 )
 def test_no_count_is_believed_that_the_bytes_do_not_bear_out(kind):
     data = (VECTORS / "invalid" / f"{kind}.rdm").read_bytes()

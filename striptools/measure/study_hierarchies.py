@@ -186,7 +186,7 @@ def _name(options: HierarchyOptions) -> str:
 
 
 def _completed(scene: Scene, threads: int) -> Scene:
-    """A copy of the scene with all that its hierarchy takes: the split that blocks are cut from, and boxes."""
+    """A copy of the scene after all that its hierarchy takes: the split that blocks are cut from, boxes."""
     fresh = replace(scene)
     split_objects(fresh.triangle_boxes(threads), PartitionOptions(block=BLOCK_TRIANGLES), threads=threads)
     fresh.with_boxes(threads)

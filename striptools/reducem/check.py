@@ -178,7 +178,8 @@ def check_nodes(scene: Scene, where: str) -> None:
     if scene.block_count == 0 or scene.hierarchy is not None:
         if len(scene.packed.nodes) or scene.packed.runs is not None:
             raise unreadable("RDM208" if scene.triangle_count == 0 else "RDM201", f"{where}: SCEN")
-        if scene.hierarchy is not None:
+        # What a file holds was looked at when it was asked for.
+        if scene.hierarchy is not None and scene.__dict__.get("_sound") is not scene.hierarchy:
             check_hierarchy(scene, scene.hierarchy, where)
         return
     given = (scene.grid, scene.triangle_boxes(), scene.block_starts, scene.starts, scene.roots)

@@ -23,7 +23,6 @@ from typing import IO, Any
 import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid, PackedNodes
-from striptools.hierarchies.presorted import Presorted
 from striptools.hierarchies.stored import StoredHierarchy
 from striptools.mesh.attributes import Domain, Material
 from striptools.reducem import check, layout
@@ -395,33 +394,21 @@ class _File:
 
     def triangles(self) -> PlainTriangles | None:
         """The plain triangles, checked by themselves."""
-        count = self.record["triangle_count"]
-        if layout.TRIANGLES.kind not in self.entries and layout.HIERARCHY.kind not in self.entries:
+        if layout.TRIANGLES.kind not in self.entries:
             return None
-        least, most = layout.triangle_lengths(count) if count and self.is_presorted() else (0, 0)
-        raw = self.section(layout.TRIANGLES, least, most)
-        return decode_triangles(raw, count, self.where) if len(raw) else None
-
-    @cached_property
-    def stored_hierarchy(self) -> StoredHierarchy | None:
-        """What HIER holds, its record checked."""
         count = self.record["triangle_count"]
-        if layout.HIERARCHY.kind not in self.entries:
-            return None
-        raw = self.section(
-            layout.HIERARCHY, 1 if count else 0, layout.most_hierarchy_bytes(count) * bool(count)
-        )
-        return decode_hierarchy(raw, self.where)
-
-    def is_presorted(self) -> bool:
-        """Whether the hierarchy is one that asks for plain triangles."""
-        return isinstance(self.stored_hierarchy, Presorted)
+        raw = self.section(layout.TRIANGLES, *(layout.triangle_lengths(count) if count else (0, 0)))
+        return decode_triangles(raw, count, self.where)
 
     def hierarchy(self, scene: Scene) -> StoredHierarchy | None:
         """A hierarchy other than the default one, checked against the triangles."""
-        found = self.stored_hierarchy
-        if found is not None:
-            check_hierarchy(scene, found, self.where)
+        if layout.HIERARCHY.kind not in self.entries:
+            return None
+        count = self.record["triangle_count"]
+        most = layout.most_hierarchy_bytes(count) if count else 0
+        found = decode_hierarchy(self.section(layout.HIERARCHY, min(1, count), most), self.where)
+        check_hierarchy(scene, found, self.where)
+        scene.__dict__["_sound"] = found
         return found
 
     def json(self, raw: np.ndarray, kind: str, malformed: str, deep: str) -> Any:
