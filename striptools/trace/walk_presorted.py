@@ -25,7 +25,6 @@ Differences:
    place of a root.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -83,10 +82,11 @@ class Found(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """A presorted tree: its first triangle and the one after its last; () int32."""
+    """A presorted tree: its first triangle, the one after its last, and where its stack begins; () int32."""
 
     first: Array
     end: Array
+    floor: Array
 
 
 class Place(NamedTuple):
@@ -105,6 +105,18 @@ class Place(NamedTuple):
     span: Interval
     height: Array
     turns: Array
+
+
+class Walked(NamedTuple):
+    """What a loop of the walk carries: where the ray is, the places that wait, and what it has found.
+
+    An entry of the stack is 3 int32: of plain nodes the row, of a tree's 4 times the first triangle + the
+    axis; then the bits of entry and leaving.
+    """
+
+    place: Place
+    stack: Array
+    found: Found
 
 
 class PresortedScene(NamedTuple):
@@ -155,56 +167,54 @@ def _walk(scene: PresortedScene, ray: ReadyRay, stack: Array, options: WalkOptio
     """Walk the plain nodes, and at each leaf that is met the tree below it."""
     zero = jnp.int32(0)
     counts = jnp.zeros(len(Counters._fields) if options.counting else 0, jnp.int32)
-    found = Found(ray.t_max, MISS + zero, counts)
-    everywhere = Interval(jnp.float32(0), ray.t_max * SLACK)
-    met, span = _box_met(scene, zero, ray, everywhere)
-    found = found.counting(_A_PLAIN_BOX)
+    found = Found(ray.t_max, MISS + zero, counts).counting(_A_PLAIN_BOX)
+    met, span = _box_met(scene, zero, ray, Interval(jnp.float32(0), ray.t_max * SLACK))
     start = Place(jnp.where(is_live(ray) & met, 0, NONE), zero, span, zero, zero)
 
-    def goes_on(place: Place) -> Array:
-        return (place.node >= 0) & (place.turns <= scene.most_turns)
-
     def in_reach(place: Place, found: Found) -> Array:
-        return goes_on(place) & (place.span.entry <= found.nearest * SLACK)
+        return _goes_on(scene, place) & (place.span.entry <= found.nearest * SLACK)
 
-    def is_inner(carried: tuple[Place, Array, Found]) -> Array:
-        place, _, found = carried
-        return in_reach(place, found) & (_word(scene, place.node, 7) == 0)
+    def is_inner(walked: Walked) -> Array:
+        return in_reach(walked.place, walked.found) & (_word(scene, walked.place.node, 7) == 0)
 
-    def descend_then_sort_out(carried: tuple[Place, Array, Found]) -> tuple[Place, Array, Found]:
-        place, stack, found = lax.while_loop(is_inner, lambda c: _visit_plain(scene, ray, *c), carried)
-        leaf = place.node
-        first, count = _word(scene, leaf, 6), _word(scene, leaf, 7)
-        below, floor = Tree(first, first + count), place.height
+    def descend_to_tree(walked: Walked) -> Walked:
+        walked = lax.while_loop(is_inner, lambda walked: _visit_plain(scene, ray, walked), walked)
+        place, _, found = walked
+        first, count = _word(scene, place.node, 6), _word(scene, place.node, 7)
         at_leaf = in_reach(place, found) & (count != 0)
         root = place._replace(node=jnp.where(at_leaf, first, NONE), axis=zero)
-        found = found.counting(_A_LEAF, at_leaf)
+        tree = Tree(first, first + count, place.height)
+        walked = walked._replace(place=root, found=found.counting(_A_LEAF, at_leaf))
+        place, stack, found = _walk_tree(scene, ray, tree, walked, options.any_hit)
+        return Walked(_popped(place._replace(height=tree.floor), stack, zero), stack, found)
 
-        def in_tree(carried: tuple[Place, Array, Found]) -> Array:
-            return goes_on(carried[0])
+    def goes_on(walked: Walked) -> Array:
+        going = _goes_on(scene, walked.place)
+        return going & (walked.found.face < 0) if options.any_hit else going
 
-        inside, stack, found = lax.while_loop(
-            in_tree,
-            lambda c: _visit_presorted(scene, ray, below, floor, options.any_hit, *c),
-            (root, stack, found),
-        )
-        place = _popped(inside._replace(height=floor), stack, zero)
-        if options.any_hit:
-            place = place._replace(node=jnp.where(found.face >= 0, NONE, place.node))
-        return place, stack, found
-
-    place, stack, found = lax.while_loop(
-        lambda c: goes_on(c[0]), descend_then_sort_out, (start, stack, found)
-    )
+    place, stack, found = lax.while_loop(goes_on, descend_to_tree, Walked(start, stack, found))
     best = Best(found.nearest, found.nearest[None], found.face[None])
     counted = Counters(*found.counts) if options.counting else no_counts()
     return stack, Ended(best, counted, place.turns > scene.most_turns)
 
 
-def _visit_plain(
-    scene: PresortedScene, ray: ReadyRay, place: Place, stack: Array, found: Found
-) -> tuple[Place, Array, Found]:
+def _walk_tree(scene: PresortedScene, ray: ReadyRay, tree: Tree, walked: Walked, any_hit: bool) -> Walked:
+    """Walk a presorted tree from its root, or not at all where the place is `NONE`."""
+
+    def goes_on(walked: Walked) -> Array:
+        going = _goes_on(scene, walked.place)
+        return going & (walked.found.face < 0) if any_hit else going
+
+    return lax.while_loop(goes_on, lambda walked: _visit_presorted(scene, ray, tree, walked), walked)
+
+
+def _goes_on(scene: PresortedScene, place: Place) -> Array:
+    return (place.node >= 0) & (place.turns <= scene.most_turns)
+
+
+def _visit_plain(scene: PresortedScene, ray: ReadyRay, walked: Walked) -> Walked:
     """Test the boxes of both children, go to the nearer one, and let the other wait."""
+    place, stack, found = walked
     limit = found.nearest * SLACK
     one, two = place.node + 1, _word(scene, place.node, 6)
     left = Interval(place.span.entry, smaller(place.span.leaving, limit))
@@ -219,23 +229,14 @@ def _visit_plain(
     height = jnp.where(met_one & met_two, place.height + 1, place.height)
     there = Place(near, place.axis, span, height, place.turns + 1)
     found = found.counting(_A_NODE).counting(_A_PLAIN_BOX, jnp.int32(2))
-    return _or_popped(met_one | met_two, there, stack, jnp.int32(0)), stack, found
+    return Walked(_or_popped(met_one | met_two, there, stack, jnp.int32(0)), stack, found)
 
 
-def _visit_presorted(
-    scene: PresortedScene,
-    ray: ReadyRay,
-    tree: Tree,
-    floor: Array,
-    any_hit: bool,
-    place: Place,
-    stack: Array,
-    found: Found,
-) -> tuple[Place, Array, Found]:
+def _visit_presorted(scene: PresortedScene, ray: ReadyRay, tree: Tree, walked: Walked) -> Walked:
     """Make a node's slab of the triangles it owns; where it is met, test them and go on to the children."""
-    own = lax.dynamic_slice(scene.corners, (index(place.node), index(place.axis), jnp.uint32(0)), (2, 1, 3))[
-        :, 0
-    ]
+    place, stack, found = walked
+    at = (index(place.node), index(place.axis), jnp.uint32(0))
+    own = lax.dynamic_slice(scene.corners, at, (2, 1, 3))[:, 0]
     has_two = place.node + 1 < tree.end
     low_one, high_one = _extremes(own[0])
     low_two, high_two = _extremes(own[1])
@@ -258,7 +259,7 @@ def _visit_presorted(
             found = _test_by_bandwidth(scene, ray, triangle, there, sides, place.axis, span, found)
         return found
 
-    found = lax.cond(met, test, lambda found: found, found)
+    found = lax.cond(met, test, _same, found)
 
     # The children, the one that the ray comes to first before the other; the second may be missing.
     axis = _next_axis(place.axis)
@@ -271,10 +272,8 @@ def _visit_presorted(
     stack = _pushed(stack, place.height, far * 4 + axis, span)
     height = jnp.where(met & both, place.height + 1, place.height)
     there = Place(near, axis, span, height, place.turns + 1)
-    place = _or_popped(met & (one < tree.end), there, stack, floor, packed=True)
-    if any_hit:
-        place = place._replace(node=jnp.where(found.face >= 0, NONE, place.node))
-    return place, stack, found
+    place = _or_popped(met & (one < tree.end), there, stack, tree.floor, packed=True)
+    return Walked(place, stack, found)
 
 
 def _test(scene: PresortedScene, ray: ReadyRay, triangle: Array, there: Array, found: Found) -> Found:
@@ -298,31 +297,36 @@ def _test_by_bandwidth(
     span: Interval,
     found: Found,
 ) -> Found:
-    """Test a triangle after its own slabs, axis by axis, the first from coordinates at hand."""
-
-    def same(found: Found) -> Found:
-        return found
-
-    def after(axis: Array, span: Interval, then: Callable[[Array, Interval, Found], Found]) -> Any:
-        def load(found: Found) -> Found:
-            extremes = _extremes(jnp.stack(_axis_of(scene, triangle, index(axis))))
-            clipped = _clipped(span, *extremes, ray.slab, axis)
-            found = found.counting(_AN_AXIS + _A_SLAB)
-            met = _is_met(clipped, found.nearest * SLACK)
-            return lax.cond(met, lambda found: then(axis, clipped, found), same, found)
-
-        return load
-
-    def last(_axis: Array, _span: Interval, found: Found) -> Found:
-        return _test(scene, ray, triangle, jnp.bool_(True), found)
-
-    def third(axis: Array, span: Interval, found: Found) -> Found:
-        return after(_next_axis(axis), span, last)(found)
-
+    """Test a triangle if its own slab is met, made of coordinates at hand, and then those of other axes."""
     span = _clipped(span, *sides, ray.slab, axis)
     met = there & _is_met(span, found.nearest * SLACK)
     found = found.counting(_A_SLAB, there)
-    return lax.cond(met, after(_next_axis(axis), span, third), same, found)
+    return lax.cond(met, lambda found: _pass_axes(scene, ray, triangle, axis, span, 2, found), _same, found)
+
+
+def _pass_axes(
+    scene: PresortedScene,
+    ray: ReadyRay,
+    triangle: Array,
+    axis: Array,
+    span: Interval,
+    left: int,
+    found: Found,
+) -> Found:
+    """Load the next axis while there are any left, go on where its slab is met, and test the triangle."""
+    if left == 0:
+        return _test(scene, ray, triangle, jnp.bool_(True), found)
+    axis = _next_axis(axis)
+    span = _clipped(span, *_extremes(_axis_of(scene, triangle, index(axis))), ray.slab, axis)
+    met = _is_met(span, found.nearest * SLACK)
+    found = found.counting(_AN_AXIS + _A_SLAB)
+    return lax.cond(
+        met, lambda found: _pass_axes(scene, ray, triangle, axis, span, left - 1, found), _same, found
+    )
+
+
+def _same(found: Found) -> Found:
+    return found
 
 
 def _box_met(scene: PresortedScene, node: Array, ray: ReadyRay, span: Interval) -> tuple[Array, Interval]:
@@ -352,7 +356,7 @@ def _is_met(span: Interval, limit: Array) -> Array:
     return span.entry <= smaller(limit, span.leaving)
 
 
-def _extremes(values: Array) -> tuple[Array, Array]:
+def _extremes(values: Array | tuple[Array, Array, Array]) -> tuple[Array, Array]:
     """The least and the greatest of three."""
     a, b, c = values
     return smaller(smaller(a, b), c), larger(larger(a, b), c)
