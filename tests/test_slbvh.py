@@ -38,9 +38,9 @@ from striptools.trace import Tracer, walk_single
 from striptools.trace.box import lanes_met
 from striptools.trace.launch import program
 from striptools.trace.slbvh import lay_out_slbvh
-from striptools.trace.walk import SLACK, prepared_rays, ready_ray
+from striptools.trace.walk import MISS, SLACK, WalkOptions, prepared_rays, ready_ray
 from striptools.trace.walk_single import nothing_yet
-from striptools.trace.walk_slbvh import Place, _State, _visit, step_in, step_out
+from striptools.trace.walk_slbvh import Place, SlbvhScene, _State, _visit, step_in, step_out
 
 BALANCES = ("sah", "morton")
 OVERS = ("triangles", "strips", "blocks")
@@ -509,6 +509,25 @@ def test_no_loop_carries_a_stack(any_hit, count):
 def test_a_stack_would_be_seen():
     carries = carries_of(small_scene())
     assert (16, 2) in {shape for shapes in carries for shape in shapes}
+
+
+@pytest.mark.parametrize("name", ["soup", "closed"])
+def test_all_rays_at_once_have_the_same_hits_and_visits(name):
+    """As a GPU walks them: by vmap."""
+    scene = under(scene_named(name), "triangles", "sah")
+    arrays = jax.tree.map(jnp.asarray, lay_out_slbvh(scene, scene.hierarchy).arrays)
+    rays = aimed_rays(scene.positions, scene.faces(), 64, 5)
+    ready = prepared_rays(arrays, *rays, np.full(64, np.inf, np.float32)).at[7].set(0)
+    one_by_one, at_once = (
+        jax.jit(SlbvhScene.walk_rays, static_argnums=2)(
+            arrays, ready, WalkOptions(1, False, True, 16, batch=batch)
+        )
+        for batch in (False, True)
+    )
+    for one, other in zip(one_by_one, at_once, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert one_by_one.name[7] == MISS
+    assert (one_by_one.name >= 0).any()
 
 
 def test_a_heap_without_end_is_stuck_and_no_hang():

@@ -256,9 +256,10 @@ def _check_node_boxes(slbvh: Slbvh, boxes: Boxes) -> None:
 
 def _check_exact(held: Boxes, below: Boxes, node: np.ndarray) -> None:
     # Written so that a comparison with NaN says no.
-    holds = (held[:, :3] <= below[:, :3]).all(axis=1) & (held[:, 3:] >= below[:, 3:]).all(axis=1)
-    _raise_at(~holds, "a box does not hold what is below it", node)
-    _raise_at((held != below).any(axis=1), "a box is larger than what is below it", node)
+    holds = np.concatenate([held[:, :3] <= below[:, :3], held[:, 3:] >= below[:, 3:]], axis=1)
+    _raise_at(~np.logical_and.reduce(holds, axis=1), "a box does not hold what is below it", node)
+    larger = np.logical_or.reduce(held != below, axis=1)
+    _raise_at(larger, "a box is larger than what is below it", node)
 
 
 def _raise_at(flaws: np.ndarray, what: str, nodes: np.ndarray | None = None) -> None:
