@@ -20,15 +20,15 @@ Differences:
 2. Objects of one cell are sorted further, by the next 15 bits of the Morton codes of their centres, and made
    one subtree first, by the prefixes they share there, then by place. The theorems need distinct keys; and
    objects of like size are many in a cell.
-3. A level is at most 48, so that this fits a key of 64 bits; where small objects are, the whole Morton code of
-   63 bits counts.
+3. A level is at most 48, so that this fits a key of 64 bits; the whole Morton code of 63 bits counts where
+   objects are that small.
 4. Threads and atomic counters give way to one sweep from the last object to the first, with a stack. It
    writes each node once, at its place in preorder.
 5. A leaf over triangles takes up to eight where the surface area heuristic finds that no dearer.
 6. The root's cell is the least cube at the low corner of the bounds that holds them.
 
-Cost: O(n) time: a pass for the cells, one for the keys, one radix sort of 64-bit keys and the sweep; 64 bytes
-an object for the sort and the words, and up to 64 for the nodes.
+Cost: O(n) time: a pass for the cells, one for the keys, one radix sort of 64-bit keys and the sweep; 40 bytes
+an object for words, keys and the sort, and up to 64 for the nodes.
 """
 
 from dataclasses import dataclass

@@ -254,7 +254,9 @@ def _row(
 
 def tables(study: LooseStudy) -> list[tuple[str, list[dict[str, object]]]]:
     """The study as tables, each a title and rows: the hierarchies, then each kind of rays."""
-    title = f"{study.triangles:,} triangles on {', '.join(study.devices)}; lead: seconds of {SAH} over the row's"
+    title = (
+        f"{study.triangles:,} triangles on {', '.join(study.devices)}; lead: seconds of {SAH} over the row's"
+    )
     parts: list[tuple[str, list[dict[str, object]]]] = [
         (title, [_hierarchy(study, row) for row in study.rows])
     ]
