@@ -78,7 +78,7 @@ def descends(node, ancestor):
 
 
 def triples_that_fail(nodes, depth, measure, same_side=False):
-    """Triples h < i < j, of nodes by key, where a measure does not stand for eta, or ties where it may not."""
+    """Triples h < i < j, of nodes by key, where a measure does not stand for eta, or ties wrongly."""
     failed = []
     for h, i, j in combinations(nodes, 3):
         if same_side:

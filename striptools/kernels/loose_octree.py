@@ -72,8 +72,8 @@ def finest_cell(begin, end):
 def halvings(begin, end, place):
     """How often the root's cell may be halved on an axis so that, made loose, it holds an object.
 
-    A loose cell is half a cell larger on either side. `begin` and `end` are the object's sides in units of the
-    root's cell, `place` is the finest cell of its centre.
+    A loose cell is half a cell larger on either side. `begin` and `end` are the object's sides in units of
+    the root's cell, `place` is the finest cell of its centre.
     """
     # A cell as large as the object holds it, wherever in the cell its centre is: read off the exponent.
     count = np.int64(1022) - ((np.float64(end - begin).view(np.int64) - 1) >> 52)

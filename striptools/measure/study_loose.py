@@ -8,8 +8,8 @@ builds over the same triangles and over the same strips, walked by the same prog
 1. Build seconds are processor time on one thread, of all that lies between the objects' boxes and 32-byte
    nodes; the builds take turns. Triangles and strips lie in the order of the scene file, and once more at
    random, as a mesh off the shelf may have them.
-2. Expected cost is that of a tree over the objects, one a leaf, then balanced halves down to single triangles,
-   by the one cost model, over that of a full binned SAH tree over the triangles.
+2. Expected cost is that of a tree over the objects, one a leaf, then balanced halves down to single
+   triangles, by the one cost model, over that of a full binned SAH tree over the triangles.
 3. Traced hierarchies have leaves as they are built to be used: up to eight triangles, or one strip.
 """
 
