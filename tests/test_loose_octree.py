@@ -78,7 +78,7 @@ def descends(node, ancestor):
 
 
 def triples_that_fail(nodes, depth, measure, same_side=False):
-    """Triples h < i < j, of nodes by key, at which a measure does not stand for eta, or ties against theorem 2."""
+    """Triples h < i < j, of nodes by key, where a measure does not stand for eta, or ties wrongly."""
     failed = []
     for h, i, j in combinations(nodes, 3):
         if same_side:
@@ -158,8 +158,8 @@ def cell_box(level, code, loose):
             low[axis] = middle
         else:
             high[axis] = middle
-    more = [(h - l) / 2 * loose for l, h in zip(low, high, strict=True)]
-    return [l - m for l, m in zip(low, more, strict=True)] + [h + m for h, m in zip(high, more, strict=True)]
+    more = [(end - begin) / 2 * loose for begin, end in zip(low, high, strict=True)]
+    return [low[k] - more[k] for k in range(3)] + [high[k] + more[k] for k in range(3)]
 
 
 def holds(outer, inner):

@@ -20,15 +20,15 @@ Differences:
 2. Objects of one cell are sorted further, by the next 15 bits of the Morton codes of their centres, and made
    one subtree first, by the prefixes they share there, then by place. The theorems need distinct keys; and
    objects of like size are many in a cell.
-3. A level is at most 48, so that this fits a key of 64 bits; where small objects are, the whole Morton code of
-   63 bits counts.
+3. A level is at most 48, so that this fits a key of 64 bits; the whole Morton code of 63 bits counts where
+   objects are that small.
 4. Threads and atomic counters give way to one sweep from the last object to the first, with a stack. It
    writes each node once, at its place in preorder.
 5. A leaf over triangles takes up to eight where the surface area heuristic finds that no dearer.
 6. The root's cell is the least cube at the low corner of the bounds that holds them.
 
-Cost: O(n) time: a pass for the cells, one for the keys, one radix sort of 64-bit keys and the sweep; 64 bytes
-an object for the sort and the words, and up to 64 for the nodes.
+Cost: O(n) time: a pass for the cells, one for the keys, one radix sort of 64-bit keys and the sweep; 40 bytes
+an object for words, keys and the sort, and up to 64 for the nodes.
 """
 
 from dataclasses import dataclass
@@ -185,3 +185,21 @@ def _words_and_keys(
 
 def _unless_identity(order: Counts) -> Counts | None:
     return None if np.array_equal(order, np.arange(len(order))) else order
+
+
+# Notes. Expected cost of one triangle a leaf over that of a full binned SAH tree: by centres alone (LBVH), with
+# levels that are whole ones of the octree, and with binary ones as here; triangles in the order of a SAH tree.
+#
+#     powerplant 1.212, 1.019, 0.929    cocoa_temple 1.392, 1.027, 1.038    kicad_acepack 1.192, 1.156, 1.126
+#     fzk_haus   1.195, 1.119, 1.098    icub         1.224, 1.255, 1.238    chandelier    1.344, 1.355, 1.353
+#
+# Where triangles are of about one size (dragon, icub) extent says nothing that the centre does not, and cells
+# full of equals cost 1 %. Cells three binary levels finer, loose by three times their size: 0.949, 1.065,
+# 1.118, 1.087, 1.212, 1.344 in the order above; no worse than an LBVH anywhere, no better on the whole.
+#
+# Objects of one cell halved by place, without the finer bits of their centres: 1.172 on the powerplant in the
+# order of a SAH tree and 7.1 at random, where it is 0.958 with them; whole octree levels 1.40 and 14. A pipe
+# is as long as its triangles, so that thousands of them share a cell.
+#
+# The first form of the search for a cell, a loop that halves, took 45 ns an object; the exponent takes 15.
+# Reading the stack's boxes entry by entry between writes took 45 ns an object in the sweep; whole rows 36.

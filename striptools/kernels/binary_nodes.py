@@ -53,29 +53,41 @@ def new_forest(nodes):
 
 
 @inlined
-def write_leaf(forest, entry, node, first, end):
-    """Write the leaf over the objects first:end, with the box of a subtree."""
+def write_node(forest, node, box, word, held):
+    """Write a node: a leaf over so many objects from the first one, or an inner node and its second child."""
     for k in range(6):
-        forest.corners[node, k] = forest.box[entry, k]
-    forest.nodes[node, 6] = np.uint32(first)
-    forest.nodes[node, 7] = np.uint32(end - first)
+        forest.corners[node, k] = box[k]
+    forest.nodes[node, 6] = np.uint32(word)
+    forest.nodes[node, 7] = np.uint32(held)
 
 
 @inlined
-def put_leaf(forest, entry, last, item, boxes, box, leaf_cost):
+def put_leaf(forest, entry, last, item, boxes, row, leaf_cost):
     """Put object `item`, which has a row of boxes, on the stack; returns its node, before the last one."""
-    node = last - 1
+    # Unsigned indices are not looked at for being negative; a row read whole may not overlap what is written.
+    node, entry, row = np.uint64(last - 1), np.uint64(entry), np.uint64(row)
+    box = (boxes[row, 0], boxes[row, 1], boxes[row, 2], boxes[row, 3], boxes[row, 4], boxes[row, 5])
     for k in range(6):
-        forest.box[entry, k] = boxes[box, k]
+        forest.box[entry, k] = box[k]
+    write_node(forest, node, box, item, 1)
+    forest.cost[entry] = leaf_cost * half_area(box[0], box[1], box[2], box[3], box[4], box[5])
     forest.items[entry, 0] = item
     forest.items[entry, 1] = item + 1
-    forest.place[entry, 0] = node
+    forest.place[entry, 0] = last - 1
     forest.place[entry, 1] = last
-    write_leaf(forest, entry, node, item, item + 1)
-    forest.cost[entry] = leaf_cost * half_area(
-        boxes[box, 0], boxes[box, 1], boxes[box, 2], boxes[box, 3], boxes[box, 4], boxes[box, 5]
-    )
-    return node
+    return last - 1
+
+
+@inlined
+def smaller(a, b):
+    """The smaller of two: one instruction, where min minds numbers that are none."""
+    return a if a < b else b
+
+
+@inlined
+def larger(a, b):
+    """The larger of two."""
+    return a if a > b else b
 
 
 @inlined
@@ -84,31 +96,29 @@ def join_two(forest, left, last, most, node_cost, leaf_cost):
 
     Up to `most` objects become a leaf where that is no dearer.
     """
-    right = left - 1
-    for k in range(3):
-        forest.box[right, k] = min(forest.box[left, k], forest.box[right, k])
-        forest.box[right, k + 3] = max(forest.box[left, k + 3], forest.box[right, k + 3])
-    area = half_area(
-        forest.box[right, 0],
-        forest.box[right, 1],
-        forest.box[right, 2],
-        forest.box[right, 3],
-        forest.box[right, 4],
-        forest.box[right, 5],
+    left, right = np.uint64(left), np.uint64(left - 1)
+    old = forest.box
+    box = (
+        smaller(old[left, 0], old[right, 0]),
+        smaller(old[left, 1], old[right, 1]),
+        smaller(old[left, 2], old[right, 2]),
+        larger(old[left, 3], old[right, 3]),
+        larger(old[left, 4], old[right, 4]),
+        larger(old[left, 5], old[right, 5]),
     )
+    area = half_area(box[0], box[1], box[2], box[3], box[4], box[5])
     first, end = forest.items[left, 0], forest.items[right, 1]
     cost = forest.cost[left] + forest.cost[right] + node_cost * area
     if end - first <= most and leaf_cost * area <= cost:
         # Write the leaf over the nodes of both.
-        node = forest.place[right, 1] - 1
         cost = leaf_cost * area
-        write_leaf(forest, right, node, first, end)
+        node = np.int64(forest.place[right, 1]) - 1
+        write_node(forest, np.uint64(node), box, first, end - first)
     else:
         node = last - 1
-        for k in range(6):
-            forest.corners[node, k] = forest.box[right, k]
-        forest.nodes[node, 6] = np.uint32(forest.place[right, 0])
-        forest.nodes[node, 7] = np.uint32(0)
+        write_node(forest, np.uint64(node), box, forest.place[right, 0], 0)
+    for k in range(6):
+        forest.box[right, k] = box[k]
     forest.cost[right] = cost
     forest.items[right, 0] = first
     forest.place[right, 0] = node

@@ -62,32 +62,27 @@ def below_highest(x):
 
 
 @inlined
-def cell_at(place, low, scale):
-    """Which of 2**21 cells a place is in; places outside are in the nearest."""
+def finest_cell(begin, end):
+    """Which of 2**21 cells the middle is in; one outside is in the nearest."""
     last = np.float64((1 << MOST_BITS) - 1)
-    return np.int64(min(max((place - low) * scale, 0.0), last))
+    return np.int64(min(max((begin + end) * (1 << (MOST_BITS - 1)), 0.0), last))
 
 
 @inlined
-def halvings(box_low, box_high, low, size, place):
+def halvings(begin, end, place):
     """How often the root's cell may be halved on an axis so that, made loose, it holds an object.
 
-    A loose cell is half a cell larger on either side. `place` is the finest cell of the object's centre.
+    A loose cell is half a cell larger on either side. `begin` and `end` are the object's sides in units of
+    the root's cell, `place` is the finest cell of its centre.
     """
-    # A cell as large as the object holds it, wherever in the cell its centre is.
-    extent = box_high - box_low
-    count = np.int64(0)
-    cell = size * 0.5
-    while cell >= extent and count < MOST_HALVINGS:
-        count += 1
-        cell *= 0.5
+    # A cell as large as the object holds it, wherever in the cell its centre is: read off the exponent.
+    count = np.int64(1022) - ((np.float64(end - begin).view(np.int64) - 1) >> 52)
+    count = min(count, MOST_HALVINGS - 1)
 
     # One of half that side may, and none of a quarter does.
-    if count < MOST_HALVINGS:
-        corner = low + np.float64(place >> (MOST_BITS - 1 - count)) * cell
-        if box_low >= corner - 0.5 * cell and box_high <= corner + 1.5 * cell:
-            count += 1
-    return count
+    scale = np.int64((count + 1024) << 52).view(np.float64)
+    cell = np.float64(place >> (MOST_BITS - 1 - count))
+    return count + np.int64(begin * scale >= cell - 0.5 and end * scale <= cell + 1.5)
 
 
 @kernel
@@ -107,21 +102,21 @@ def place_words(boxes, begin, end, low, size, by_extent, words):
     Returns:
         The cells of all words, joined by or.
     """
-    scale = (1 << MOST_BITS) / size
+    unit = 1.0 / size
     seen = np.uint64(0)
     for item in range(begin, end):
-        low_x, high_x = np.float64(boxes[item, 0]), np.float64(boxes[item, 3])
-        low_y, high_y = np.float64(boxes[item, 1]), np.float64(boxes[item, 4])
-        low_z, high_z = np.float64(boxes[item, 2]), np.float64(boxes[item, 5])
-        x = cell_at((low_x + high_x) * 0.5, low[0], scale)
-        y = cell_at((low_y + high_y) * 0.5, low[1], scale)
-        z = cell_at((low_z + high_z) * 0.5, low[2], scale)
+        low_x, high_x = (boxes[item, 0] - low[0]) * unit, (boxes[item, 3] - low[0]) * unit
+        low_y, high_y = (boxes[item, 1] - low[1]) * unit, (boxes[item, 4] - low[1]) * unit
+        low_z, high_z = (boxes[item, 2] - low[2]) * unit, (boxes[item, 5] - low[2]) * unit
+        x, y, z = finest_cell(low_x, high_x), finest_cell(low_y, high_y), finest_cell(low_z, high_z)
         level = np.int64(LEVELS)
         if by_extent:
             # Binary levels halve x, then y, then z.
-            on_x = halvings(low_x, high_x, low[0], size, x)
-            on_y = halvings(low_y, high_y, low[1], size, y)
-            on_z = halvings(low_z, high_z, low[2], size, z)
+            on_x, on_y, on_z = (
+                halvings(low_x, high_x, x),
+                halvings(low_y, high_y, y),
+                halvings(low_z, high_z, z),
+            )
             level = min(min(min(3 * on_x, 3 * on_y + 1), 3 * on_z + 2), level)
         code = spread_bits(np.uint64(x)) << np.uint64(2)
         code |= spread_bits(np.uint64(y)) << ONE

@@ -7,8 +7,9 @@ from striptools.kernels.compiled import inlined, kernel, maker
 MOST_BITS = 21
 """Bits an axis: three times as many fit a key."""
 
-DIGIT_BITS = 11
+DIGIT_BITS = 8
 DIGITS = 1 << DIGIT_BITS
+PASSES = 64 // DIGIT_BITS
 
 
 @inlined
@@ -60,26 +61,30 @@ def morton_codes(items, low, high, bits=MOST_BITS):
 
 
 @maker
-def sort_by_digit(keys, order, other_keys, other_order, shift, place):
+def sort_by_digit(keys, order, other_keys, other_order, shift, counts):
     """Move keys and what they stand for to the other arrays, by one digit, keeping the order of equals."""
-    # Count the digits, and turn the counts into first places.
-    place[:] = 0
-    for k in range(keys.shape[0]):
-        place[((keys[k] >> shift) & np.uint64(DIGITS - 1)) + np.uint64(1)] += 1
+    # Turn the counts of the digits into first places.
+    place = np.int64(0)
     for digit in range(DIGITS):
-        place[digit + 1] += place[digit]
+        count = counts[digit]
+        counts[digit] = place
+        place += count
 
     # Put every key in its place.
     for k in range(keys.shape[0]):
         digit = (keys[k] >> shift) & np.uint64(DIGITS - 1)
-        other_keys[place[digit]] = keys[k]
-        other_order[place[digit]] = order[k]
-        place[digit] += 1
+        at = np.uint64(counts[digit])
+        other_keys[at] = keys[k]
+        other_order[at] = order[k]
+        counts[digit] += 1
 
 
 @kernel
 def radix_order(keys):
     """The order that sorts keys, equal ones by index.
+
+    Digits of 8 bits: with 11, which take fewer passes, the places written to no longer fit the nearest cache
+    and the pages known to the processor, and sorting a million keys takes 1.4 to 1.9 times as long.
 
     Args:
         keys: (p,) uint64, fewer than 2**31.
@@ -92,18 +97,21 @@ def radix_order(keys):
     other_order = np.empty(count, np.int32)
     keys = keys.copy()
     other_keys = np.empty(count, np.uint64)
-    place = np.empty(DIGITS + 1, np.int64)
 
-    # Find the bits in which keys differ: the other digits need no pass.
+    # Count all digits, and find the bits in which keys differ: the other digits need no pass.
+    counts = np.zeros((PASSES, DIGITS), np.int64)
     varying = np.uint64(0)
     for k in range(count):
-        varying |= keys[k] ^ keys[0]
+        key = keys[k]
+        varying |= key ^ keys[0]
+        for digit in range(PASSES):
+            counts[digit, (key >> np.uint64(digit * DIGIT_BITS)) & np.uint64(DIGITS - 1)] += 1
 
     # Sort digit by digit, the lowest first.
-    for low_bit in range(0, 64, DIGIT_BITS):
-        shift = np.uint64(low_bit)
+    for digit in range(PASSES):
+        shift = np.uint64(digit * DIGIT_BITS)
         if (varying >> shift) & np.uint64(DIGITS - 1) != 0:
-            sort_by_digit(keys, order, other_keys, other_order, shift, place)
+            sort_by_digit(keys, order, other_keys, other_order, shift, counts[digit])
             keys, other_keys = other_keys, keys
             order, other_order = other_order, order
     return order
