@@ -20,7 +20,6 @@ A walk is bounded by the number of nodes: a tree that goes round in a circle end
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import FAR_FACTOR
@@ -72,7 +71,7 @@ class Triangles(NamedTuple):
         closer = (t > 0) & ((t < found[0]) | ((t == found[0]) & (face < found[1])))
         return jnp.where(closer, t, found[0]), jnp.where(closer, face, found[1])
 
-    def count(self, which: Array) -> Array:
+    def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return jnp.ones_like(which, jnp.int32)
 
@@ -99,7 +98,7 @@ class Strips(NamedTuple):
         """Test the triangles of a strip."""
         return tuple(test_leaf(self.leaves, which, ray, Best(*found)))
 
-    def count(self, which: Array) -> Array:
+    def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return triangles_in_leaf(self.leaves, which)
 
@@ -283,7 +282,7 @@ def _test_object(
         objects = jnp.where(jnp.arange(size, dtype=jnp.int32) == oldest, which, mail.objects)
         mail = mail._replace(objects=objects, tested=mail.tested + 1)
     if options.counting:
-        mail = mail._replace(triangles=mail.triangles + scene.things.count(index(which)))
+        mail = mail._replace(triangles=mail.triangles + scene.things.size(index(which)))
     return found, mail
 
 
