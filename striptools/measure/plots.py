@@ -61,11 +61,11 @@ def plot_study(study: Study, target: str | Path | IO[bytes], title: str = "") ->
     _plot_lengths(lengths, study)
     name = f"{title}: " if title else ""
     figure.suptitle(f"{name}{study.triangles:,} triangles, stripifiers under the same representation")
-    return write_figure(figure, target)
+    return save_figure(figure, target)
 
 
-def write_figure(figure: "Figure", target: str | Path | IO[bytes]) -> int:
-    """Write a figure as a PNG picture to a path, whole or not at all, or to a binary stream; return bytes.
+def save_figure(figure: "Figure", target: str | Path | IO[bytes]) -> int:
+    """Write a figure as a PNG picture, whole or not at all; gives the bytes written.
 
     Raises:
         WriteError: The file could not be written.

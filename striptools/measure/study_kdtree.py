@@ -20,8 +20,8 @@ import numpy as np
 
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
-from striptools.measure.plots import require_plots, write_figure
-from striptools.measure.study import StudyOptions, StudyRays, study_rays, study_times
+from striptools.measure.plots import require_plots, save_figure
+from striptools.measure.study import RaySet, StudyOptions, study_rays, tell_no_one, timed_in_turn
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert
@@ -119,7 +119,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         UsageError: An option is out of its range.
     """
     options = options or StudyOptions()
-    tell = watch or (lambda _stage, _fraction: None)
+    tell = watch or tell_no_one
     scene = convert(mesh, options.options)
     reference = Tracer(scene, device=options.device, threads=options.threads)
     rays = study_rays(scene, reference, options)
@@ -135,7 +135,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         tell("count", len(counts) / len(tracers))
         counts[key] = [_count(tracer, part) for part in rays]
     names = {" ".join(map(str, key)): key for key in tracers}
-    times = study_times({name: tracers[key] for name, key in names.items()}, rays, options.runs, tell)
+    times = timed_in_turn({name: tracers[key] for name, key in names.items()}, rays, options.runs, tell)
     trials = [
         _trial(key, *trees[key[0], key[2]], len(scene.objects(key[0])) - 1, counts[key], times[name])
         for name, key in names.items()
@@ -160,7 +160,7 @@ def _tracer(scene: Scene, tree: KdTree, mailbox: int, options: StudyOptions) -> 
     return Tracer(walked, device=options.device, threads=options.threads)
 
 
-def _count(tracer: Tracer, rays: StudyRays) -> tuple[int, int]:
+def _count(tracer: Tracer, rays: RaySet) -> tuple[int, int]:
     """Tests of triangles and steps of all rays."""
     counters = tracer.closest_hit(rays.origins, rays.directions, counters=True).counters
     assert counters is not None
@@ -275,4 +275,4 @@ def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int
     panels[1].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
     name = f"{title}: " if title else ""
     figure.suptitle(f"{name}kd-trees by the plain and by the corrected surface area metric")
-    return write_figure(figure, target)
+    return save_figure(figure, target)
