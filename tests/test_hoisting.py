@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scenes import small_scene
 
+from striptools.hierarchies.kdtree import build_kdtree
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.hierarchies.slbvh import build_slbvh
 from striptools.kernels.rays import ROW
+from striptools.partition.boxes import range_boxes
 from striptools.trace import Tracer
 from striptools.trace.launch import program
 from striptools.trace.walk import WalkOptions
@@ -31,6 +33,11 @@ def scene_under(hierarchy):
     if hierarchy == "slbvh":
         slbvh = build_slbvh(scene.triangle_boxes(1), HierarchyOptions("slbvh"))
         return replace(scene, hierarchy=slbvh)
+    if hierarchy.startswith("kdtree"):
+        over = "strips" if "strips" in hierarchy else "triangles"
+        boxes = range_boxes(scene.triangle_boxes(1), scene.objects(over))
+        tree = build_kdtree(boxes, HierarchyOptions("kdtree", over=over))
+        return replace(scene, hierarchy=tree if "mailbox" in hierarchy else replace(tree, mailbox=0))
     return scene
 
 
@@ -42,7 +49,9 @@ def compiled_text(any_hit, steps=False, hierarchy="reducem"):
     return lowered.compile().as_text()
 
 
-@pytest.mark.parametrize("hierarchy", ["reducem", "slbvh"])
+@pytest.mark.parametrize(
+    "hierarchy", ["reducem", "slbvh", "kdtree", "kdtree, mailbox", "kdtree, strips, mailbox"]
+)
 @pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
 def test_walks_are_hoisted(any_hit, steps, hierarchy):
     text = compiled_text(any_hit, steps, hierarchy)

@@ -10,8 +10,8 @@ clipped to cells ("perfect splits").
 Differences and decisions:
 1. P(L and R) = (SA_L + SA_R - SA) / SA: a cell is convex, so a ray is on both sides when it crosses the part
    of the plane within the cell, and that is the area counted twice. Hunt gives no formula.
-2. Planes lie strictly inside a cell, so no cell is flat but those of a flat model. An object in the plane goes
-   to the side where it costs less.
+2. Planes lie strictly inside a cell, so no cell is flat but those of a flat model. An object in the plane
+   goes to the side where it costs less.
 3. An object that touches the plane from one side is in that side's cell alone; a walk must take cells to be a
    margin larger than they are.
 4. Events are words of 64 bits; a clipped part is cut from the triangle afresh, in float64, and rounded
@@ -22,7 +22,6 @@ Differences and decisions:
 Cost: O(n log n) time; about 150 bytes a reference while it is built.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -140,12 +139,12 @@ def check_kdtree(tree: KdTree, boxes: Boxes, *, corners: Corners | None = None) 
     corners = _checked_corners(boxes, corners)
     _expect_shapes(tree)
     flaw, node = kernels.structure_flaw(tree.nodes, tree.references, tree.low, tree.high, len(boxes), DEEPEST)
-    _expect(flaw == kernels.SOUND, _FLAWS[flaw], node)
+    _expect(flaw == kernels.SOUND, _FLAWS[flaw], int(node))
     outside = ~((boxes[:, :3] >= tree.low) & (boxes[:, 3:] <= tree.high)).all(axis=1)
     _expect(not outside.any(), f"does not hold object {int(outside.argmax())}", 0)
     objects = np.ascontiguousarray(boxes, np.float32)
     missed, node = kernels.first_missed(tree.nodes, tree.references, tree.low, tree.high, objects, corners)
-    _expect(missed < 0, f"has a leaf without object {missed}, which is in its cell", node)
+    _expect(missed < 0, f"has a leaf without object {missed}, which is in its cell", int(node))
 
 
 _FLAWS = (
@@ -159,9 +158,7 @@ _FLAWS = (
 )
 
 
-def _grow(
-    root: kernels.Cell, deepest: int, costs: kernels.Costs, corners: np.ndarray, threads: int
-) -> _Tree:
+def _grow(root: kernels.Cell, deepest: int, costs: kernels.Costs, corners: np.ndarray, threads: int) -> _Tree:
     """Split large cells here, generation by generation, grow the rest in a pool, and put all together."""
     with ThreadPoolExecutor(max(1, threads)) as pool:
         generations: list[list[kernels.Plane]] = []
@@ -169,23 +166,22 @@ def _grow(
         cells = [root]
         while cells:
             depth = len(generations)
-            planes = list(pool.map(lambda cell: _plane_of(cell, depth < deepest, costs), cells))
+            splits = [depth < deepest and len(cell.objects) > SUBTREE for cell in cells]
+            planes = list(pool.map(_plane_of, cells, splits, [costs] * len(cells)))
             small = [cell for cell, plane in zip(cells, planes, strict=True) if plane.axis < 0]
             jobs.append([pool.submit(_subtree, cell, depth, deepest, costs, corners) for cell in small])
-            pairs = [(cell, plane) for cell, plane in zip(cells, planes, strict=True) if plane.axis >= 0]
-            halves = list(pool.map(lambda pair: kernels.split_cell(*pair, corners), pairs))
-            generations.append(planes)
+            large = [(cell, plane) for cell, plane in zip(cells, planes, strict=True) if plane.axis >= 0]
+            halves = pool.map(lambda each: kernels.split_cell(each[0], each[1], corners), large)
             cells = [cell for pair in halves for cell in pair]
-            del small, pairs, halves
+            generations.append(planes)
         grown = [[job.result() for job in generation] for generation in jobs]
     return _joined(generations, grown)
 
 
 def _plane_of(cell: kernels.Cell, splits: bool, costs: kernels.Costs) -> kernels.Plane:
-    """Where a large cell is split; nowhere where it is small."""
-    if splits and len(cell.objects) > SUBTREE:
-        return kernels.best_plane(cell, costs)
-    return kernels.Plane(-1, np.float32(0), False, 0.0)
+    """Where a cell is split: nowhere unless it may be."""
+    nowhere = kernels.Plane(-1, np.float32(0), False, 0.0)
+    return kernels.best_plane(cell, costs) if splits else nowhere
 
 
 def _subtree(
@@ -197,7 +193,7 @@ def _subtree(
 
 
 def _joined(generations: list[list[kernels.Plane]], grown: list[list[_Tree]]) -> _Tree:
-    """The whole tree, from the deepest generation of cells up: two cells of one belong to each split above."""
+    """The whole tree, from the deepest generation of cells up: two belong to each split in the one above."""
     below: list[_Tree] = []
     for planes, subtrees in zip(reversed(generations), reversed(grown), strict=True):
         pairs = iter(below)
@@ -214,7 +210,11 @@ def _split_tree(plane: kernels.Plane, below: _Tree, above: _Tree) -> _Tree:
     head = np.zeros((1, 2), np.uint32)
     head[0, 0] = np.float32(plane.position).view(np.uint32)
     head[0, 1] = 4 * (1 + len(below.nodes)) + plane.axis
-    nodes = [head, _moved(below.nodes, 1, 0), _moved(above.nodes, 1 + len(below.nodes), len(below.references))]
+    nodes = [
+        head,
+        _moved(below.nodes, 1, 0),
+        _moved(above.nodes, 1 + len(below.nodes), len(below.references)),
+    ]
     return _Tree(np.concatenate(nodes), np.concatenate([below.references, above.references]))
 
 

@@ -188,9 +188,7 @@ def best_plane(cell, costs):
                 share_below = share_both + (np.float64(position) - np.float64(low)) * ring
                 share_above = share_both + (np.float64(high) - np.float64(position)) * ring
                 both = below + planar + above - count
-                cost = split_cost(
-                    costs, below + planar, above, both, share_below, share_above, share_both
-                )
+                cost = split_cost(costs, below + planar, above, both, share_below, share_above, share_both)
                 if cost < best.cost:
                     best = Plane(axis, position, True, cost)
                 if planar > 0:
@@ -424,8 +422,8 @@ NOT_INSIDE, NOT_PREORDER, NOT_IN_ORDER, NOT_OBJECTS, TOO_DEEP, NOT_REACHED = ran
 def structure_flaw(nodes, references, low, high, objects, deepest):
     """The first flaw of a tree's form, and the node that has it; SOUND where there is none.
 
-    Sound means: nodes are in preorder, each reached once; every split lies inside its cell, so that cells tile
-    the root's; leaves take the references one after another, each those of `objects` in rising order.
+    Sound means: nodes are in preorder, each reached once; every split lies inside its cell, so that cells
+    tile the root's; leaves take the references one after another, each those of `objects` in rising order.
     """
     count = nodes.shape[0]
     bounds = np.empty((deepest + 1, 6), np.float32)

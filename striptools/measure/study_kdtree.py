@@ -21,7 +21,7 @@ import numpy as np
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
 from striptools.measure.plots import require_plots, save_figure
-from striptools.measure.study import RaySet, StudyOptions, study_rays, timed_in_turn
+from striptools.measure.study import RaySet, StudyOptions, study_rays, tell_no_one, timed_in_turn
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert
@@ -119,7 +119,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         UsageError: An option is out of its range.
     """
     options = options or StudyOptions()
-    tell = watch or (lambda _stage, _fraction: None)
+    tell = watch or tell_no_one
     scene = convert(mesh, options.options)
     reference = Tracer(scene, device=options.device, threads=options.threads)
     rays = study_rays(scene, reference, options)
@@ -128,12 +128,8 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         for metric in METRICS:
             tell("build", len(trees) / (len(OVERS) * len(METRICS)))
             trees[over, metric] = _build(scene, over, metric, options.threads or 1)
-    tracers = {
-        (over, size, metric): _tracer(scene, trees[over, metric][0], size, options)
-        for over in OVERS
-        for size in MAILBOXES
-        for metric in METRICS
-    }
+    keys: list[_Key] = [(over, size, metric) for over in OVERS for size in MAILBOXES for metric in METRICS]
+    tracers = {key: _tracer(scene, trees[key[0], key[2]][0], key[1], options) for key in keys}
     counts = {}
     for key, tracer in tracers.items():
         tell("count", len(counts) / len(tracers))
@@ -145,9 +141,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         for name, key in names.items()
     ]
     devices = tuple(str(device) for device in reference.devices)
-    return KdStudy(
-        scene.triangle_count, len(rays[0].origins), len(rays[1].origins), devices, tuple(trials)
-    )
+    return KdStudy(scene.triangle_count, len(rays[0].origins), len(rays[1].origins), devices, tuple(trials))
 
 
 def _build(scene: Scene, over: OverName, metric: MetricName, threads: int) -> tuple[KdTree, float]:
@@ -157,9 +151,7 @@ def _build(scene: Scene, over: OverName, metric: MetricName, threads: int) -> tu
     if over != "triangles":
         boxes = range_boxes(boxes, scene.objects(over))
     start = time.perf_counter()
-    tree = build_kdtree(
-        boxes, HierarchyOptions("kdtree", over=over, metric=metric), threads, corners=corners
-    )
+    tree = build_kdtree(boxes, HierarchyOptions("kdtree", over=over, metric=metric), threads, corners=corners)
     return tree, time.perf_counter() - start
 
 
@@ -180,7 +172,7 @@ def _trial(
 ) -> KdTrial:
     over, mailbox, metric = key
     primary, secondary = (
-        KdPart(*map(float, count), float(times[:, kind].min())) for kind, count in enumerate(counts)
+        KdPart(tests, steps, float(times[:, kind].min())) for kind, (tests, steps) in enumerate(counts)
     )
     return KdTrial(
         over,

@@ -20,7 +20,6 @@ A walk is bounded by the number of nodes: a tree that goes round in a circle end
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import FAR_FACTOR
@@ -72,7 +71,7 @@ class Triangles(NamedTuple):
         closer = (t > 0) & ((t < found[0]) | ((t == found[0]) & (face < found[1])))
         return jnp.where(closer, t, found[0]), jnp.where(closer, face, found[1])
 
-    def count(self, which: Array) -> Array:
+    def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return jnp.ones_like(which, jnp.int32)
 
@@ -99,7 +98,7 @@ class Strips(NamedTuple):
         """Test the triangles of a strip."""
         return tuple(test_leaf(self.leaves, which, ray, Best(*found)))
 
-    def count(self, which: Array) -> Array:
+    def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return triangles_in_leaf(self.leaves, which)
 
@@ -283,7 +282,7 @@ def _test_object(
         objects = jnp.where(jnp.arange(size, dtype=jnp.int32) == oldest, which, mail.objects)
         mail = mail._replace(objects=objects, tested=mail.tested + 1)
     if options.counting:
-        mail = mail._replace(triangles=mail.triangles + scene.things.count(index(which)))
+        mail = mail._replace(triangles=mail.triangles + scene.things.size(index(which)))
     return found, mail
 
 
@@ -324,3 +323,11 @@ def _bits(value: Array) -> Array:
 
 def _float(bits: Array) -> Array:
     return lax.bitcast_convert_type(bits, jnp.float32)
+
+
+# Notes. bunny, 256 x 256 camera rays and one more from each hit, thousands of rays a second of one thread:
+# default walk 3,960 / 2,340, this one 2,070 / 990 without a mail-box, 2,060 / 965 with one of 8. A ray takes
+# 25 / 44 steps of 15 to 20 ns here where the default one takes 6.5 / 9.7; a step waits for its node.
+# Tried and nothing gained: the stack as three arrays of one column, the axis of the slab by selects, a node
+# read at once. A mail-box costs 1 to 4 % over triangles, where few tests are saved, and gives 3 to 20 % over
+# strips (tree_japanesemaple; 4 entries do as well as 8).

@@ -2,9 +2,9 @@
 
     python tests/benches/forest.py OUT [--trees 16] [--model FILE ...] [--seed 1]
 
-OUT is a mesh file that trimesh writes (`.ply`). Trees that are grown here stand on a jittered grid in turn with
-the models of `--model`, each scaled to the height of a tree, set upright along y and turned. Leaves are
-single rhombi that lie every way, so boxes of objects overlap: what kd-trees split and objects straddle.
+OUT is a mesh file that trimesh writes (`.ply`). Trees that are grown here stand on a jittered grid in turn
+with the models of `--model`, each scaled to the height of a tree, set upright along y and turned. Leaves are
+single rhombi that lie every way: whatever plane splits their cell, many are on both sides.
 """
 
 import argparse
@@ -32,11 +32,10 @@ def grown_tree(seed: int, levels: int = 4, leaves: int = 14) -> Arrays:
             parts += [rhombus(random, end, 0.03) for _ in range(leaves)]
             continue
         for _ in range(3 + (level == 0)):
-            bent = way + 0.75 * random.normal(size=3) * (0.8 if level else 0.6)
-            share = random.uniform(0.55, 1.0)
-            waiting.append(
-                (start + way * length * share, bent / np.linalg.norm(bent), 0.62 * length, 0.55 * radius, level + 1)
-            )
+            bent = way + random.normal(size=3) * (0.6 if level else 0.45)
+            bent /= np.linalg.norm(bent)
+            fork = start + way * length * random.uniform(0.55, 1.0)
+            waiting.append((fork, bent, 0.62 * length, 0.55 * radius, level + 1))
     return joined(parts)
 
 
@@ -63,7 +62,8 @@ def rhombus(random: np.random.Generator, near: np.ndarray, size: float) -> Array
     other /= np.linalg.norm(other)
     stem = near + 1.2 * size * random.normal(size=3)
     tip = stem + 2 * size * one
-    points = np.stack([stem, stem + size * one + 0.6 * size * other, tip, stem + size * one - 0.6 * size * other])
+    middle, half = stem + size * one, 0.6 * size * other
+    points = np.stack([stem, middle + half, tip, middle - half])
     return points, np.array([[0, 1, 2], [0, 2, 3]])
 
 
