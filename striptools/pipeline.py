@@ -13,6 +13,7 @@ import numpy as np
 
 from striptools import __version__
 from striptools.errors import UnreadableMeshError, UsageError
+from striptools.hierarchies.options import HierarchyOptions
 from striptools.hierarchies.packed import BoxGrid, box_grid, build_top
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.io import load_mesh
@@ -46,6 +47,7 @@ class Options:
         precision: Every bit of float32, or a grid.
         partition: The SAH object split.
         ordering: Strips: method, cap, effort, blocks.
+        hierarchy: What rays are to walk; another than `reducem` has no instances and no boxes inside blocks.
         boxes: Those inside blocks are `rebuilt` when the scene is traced, or `stored` in the file.
         remap: Keep the source face and first corner of every triangle in the scene.
         geometry_only: Leave out normals, texture coordinates, colours, groups and materials.
@@ -55,13 +57,14 @@ class Options:
         threads: Threads of the stages that can use several; None for every core. The scene is the same.
 
     Raises:
-        UsageError: `threads` is below 1, or `boxes` is neither.
+        UsageError: `threads` is below 1, `boxes` is neither, or stored under another hierarchy.
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)
     precision: PrecisionOptions = field(default_factory=PrecisionOptions)
     partition: PartitionOptions = field(default_factory=PartitionOptions)
     ordering: OrderingOptions = field(default_factory=OrderingOptions)
+    hierarchy: HierarchyOptions = field(default_factory=HierarchyOptions)
     boxes: BoxesKind = "rebuilt"
     remap: bool = True
     geometry_only: bool = False
@@ -73,6 +76,10 @@ class Options:
             raise UsageError(f"not a number of threads: {self.threads}", remedy="give 1 or more")
         if self.boxes not in get_args(BoxesKind):
             raise UsageError(f"{self.boxes!r} is not known", where="boxes", remedy="give rebuilt or stored")
+        if self.boxes == "stored" and self.hierarchy.name != "reducem":
+            raise UsageError(
+                f"boxes inside blocks are not of {self.hierarchy.name}", where="boxes", remedy="leave it out"
+            )
 
 
 @dataclass(frozen=True)
@@ -200,6 +207,9 @@ def convert_with_report(
         ).with_attributes(cleaned.mesh, strips)
         if options.boxes == "stored":
             scene = scene.storing_boxes(threads)
+    if options.hierarchy.name != "reducem":
+        with clock.stage("hierarchy"):
+            scene = scene.under(options.hierarchy, threads)
     counts = cleaned.counts | {"strips": scene.strip_count, "blocks": scene.block_count}
     if scene.instances is not None:
         counts |= {"geometries": len(roots.blocks) - 1, "instances": len(scene.instances)}
@@ -232,7 +242,7 @@ def _loaded(source: Mesh | str | Path | IO[bytes], file_format: str | None, opti
     mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
     mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
     if keep and mesh.instances is not None:
-        reason = why_not_kept(mesh)
+        reason = why_not_kept(mesh, options.hierarchy.name)
         if reason is None:
             return mesh
         mesh = replace(mesh, notes=(*mesh.notes, f"instances flattened, for {reason}"))

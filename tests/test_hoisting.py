@@ -1,13 +1,18 @@
 """The compiled walks are hoisted: each loop is one native function, not a thunk per operation."""
 
 import re
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 from scenes import small_scene
 
+from striptools.hierarchies.kdtree import build_kdtree
+from striptools.hierarchies.options import HierarchyOptions
+from striptools.hierarchies.slbvh import build_slbvh
 from striptools.kernels.rays import ROW
+from striptools.partition.boxes import range_boxes
 from striptools.trace import Tracer
 from striptools.trace.launch import program
 from striptools.trace.walk import WalkOptions
@@ -23,17 +28,33 @@ def loops_outside_hoisted_calls(text):
     return outside
 
 
-def compiled_text(any_hit, steps=False):
-    tracer = Tracer(small_scene(), device="cpu")
-    options = tracer._options(any_hit=any_hit, steps=steps)
+def scene_under(hierarchy):
+    scene = small_scene()
+    if hierarchy == "slbvh":
+        slbvh = build_slbvh(scene.triangle_boxes(1), HierarchyOptions("slbvh"))
+        return replace(scene, hierarchy=slbvh)
+    if hierarchy.startswith("kdtree"):
+        over = "strips" if "strips" in hierarchy else "triangles"
+        boxes = range_boxes(scene.triangle_boxes(1), scene.objects(over))
+        tree = build_kdtree(boxes, HierarchyOptions("kdtree", over=over))
+        return replace(scene, hierarchy=tree if "mailbox" in hierarchy else replace(tree, mailbox=0))
+    return scene
+
+
+def compiled_text(any_hit, steps=False, hierarchy="reducem"):
+    tracer = Tracer(scene_under(hierarchy), device="cpu")
+    options = tracer._options(any_hit=any_hit, count=steps)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
     lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
     return lowered.compile().as_text()
 
 
+@pytest.mark.parametrize(
+    "hierarchy", ["reducem", "slbvh", "kdtree", "kdtree, mailbox", "kdtree, strips, mailbox"]
+)
 @pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
-def test_walks_are_hoisted(any_hit, steps):
-    text = compiled_text(any_hit, steps)
+def test_walks_are_hoisted(any_hit, steps, hierarchy):
+    text = compiled_text(any_hit, steps, hierarchy)
     assert 'xla_cpu_small_call="true"' in text
     assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
     assert loops_outside_hoisted_calls(text) == []

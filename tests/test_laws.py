@@ -14,8 +14,9 @@ from striptools.errors import UnreadableSceneError
 from striptools.reducem.reader import read_scene
 from striptools.reducem.validate import validate
 
-SMALL = ("triangle", "remap_flips", "boxes_two_blocks", "metadata", "unknown_sections")
-DEEP = ("boxes_triangle", "flips", "mode_1_narrow")
+SMALL = ("triangle", "remap_flips", "boxes_two_blocks", "metadata", "unknown_sections", "presorted_one_tree")
+DEEP = ("boxes_triangle", "flips", "mode_1_narrow", "heap_strips", "loose_strips", "cells_strips")
+DEEP += ("presorted_one_tree",)
 MOST_SECONDS = 2.0
 MOST_BYTES = 30_000_000
 
@@ -108,7 +109,8 @@ def test_noise_is_refused(noise):
 
 
 @pytest.mark.parametrize(
-    "kind", ["nodes_huge", "blocks_huge", "sections_many", "packed_bomb", "metadata_very_deep"]
+    "kind",
+    ["nodes_huge", "blocks_huge", "sections_many", "packed_bomb", "metadata_very_deep", "hierarchy_huge"],
 )
 def test_no_count_is_believed_that_the_bytes_do_not_bear_out(kind):
     data = (VECTORS / "invalid" / f"{kind}.rdm").read_bytes()

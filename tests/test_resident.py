@@ -256,7 +256,8 @@ def test_nothing_is_hit_in_an_empty_scene():
 
 def test_steps_are_counted_alike(ball):
     origins, directions = rays_at(ball, 500, 12)
-    one, two = (tracer.closest_hit(origins, directions, steps=True).steps for tracer in both(ball))
+    counted = [tracer.closest_hit(origins, directions, counters=True).counters for tracer in both(ball)]
+    one, two = (each.steps for each in counted)
     assert (two[two > 0] >= 1).all()
     assert abs(int(two.sum()) - int(one.sum())) < 0.2 * one.sum()
 
@@ -285,7 +286,7 @@ def test_walks_are_hoisted(any_hit, steps, remap):
     from test_hoisting import loops_outside_hoisted_calls
 
     tracer = both(scene_of(Mesh(*sphere(3)), remap=remap))[1]
-    options = tracer._options(any_hit=any_hit, steps=steps)
+    options = tracer._options(any_hit=any_hit, count=steps)
     lowered = program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
     text = lowered.compile().as_text()
     assert 'xla_cpu_small_call="true"' in text

@@ -310,14 +310,14 @@ def test_all_threads_give_what_one_gives(ball):
 def test_walking_all_rays_at_once_gives_the_same(ball):
     origins, directions = aimed_rays(ball.positions, ball.faces(), 200, 6)
     expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
-    options = WalkOptions(1, any_hit=False, count_steps=True, stack_size=16, batch=True)
+    options = WalkOptions(1, any_hit=False, counting=True, stack_size=16, batch=True)
     reach = np.full(len(origins), np.inf, np.float32)
     traced = jax.jit(trace_rays, static_argnames="options")(
         lay_out(ball).arrays, origins, directions, reach, options=options
     )
     np.testing.assert_array_equal(traced.t, expected.t)
     np.testing.assert_array_equal(traced.name, expected.face)
-    assert np.asarray(traced.steps).min() >= 1
+    assert np.asarray(traced.counters)[:, 0].min() >= 1
 
 
 def assert_rebuilt_gives_the_same(scene, origins, directions):
@@ -400,13 +400,13 @@ def test_steps_are_counted_only_when_asked(ball):
     tracer = Tracer(ball, device="cpu", threads=1)
     plain, counted = (
         tracer.closest_hit(origins, directions),
-        tracer.closest_hit(origins, directions, steps=True),
+        tracer.closest_hit(origins, directions, counters=True),
     )
-    assert plain.steps is None
-    assert counted.steps is not None
+    assert plain.counters is None
+    assert counted.counters is not None
     np.testing.assert_array_equal(plain.t, counted.t)
-    assert counted.steps[counted.hit].min() >= 2
-    assert (counted.steps[~counted.hit] >= 1).all()
+    assert counted.counters.steps[counted.hit].min() >= 2
+    assert (counted.counters.steps[~counted.hit] >= 1).all()
 
 
 def test_hits_beyond_t_max_do_not_count(ball):

@@ -24,7 +24,7 @@ VERBS = {
     "validate": "Name every rule of the format that a scene file breaks.",
     "verify": "Trace a scene file with JAX and prove it against its source mesh.",
     "render": "Draw a picture of a scene file with the same tracer.",
-    "study": "Compare what stripifiers make of a mesh: memory, rays a second, quality.",
+    "study": "Compare stripifiers or hierarchies on a mesh: memory, rays a second, quality.",
     "doctor": "Print the environment, for bug reports.",
 }
 """The verbs, with the line that the list of verbs shows."""

@@ -6,11 +6,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Annotated, cast
+from typing import IO, Annotated, cast, get_args
 
 import typer
 
 from striptools.errors import UnreadableMeshError, UsageError
+from striptools.hierarchies.options import (
+    MOST_LEVELS,
+    BalanceName,
+    HierarchyName,
+    HierarchyOptions,
+    MetricName,
+    OverName,
+)
 from striptools.mesh.clean import RECENTRINGS, CleanOptions, Recentring, clean
 from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh, unkept
 from striptools.mesh.mesh import Mesh
@@ -30,6 +38,7 @@ from striptools.strips.ordering import (
     OrderingOptions,
 )
 from striptools_cli import log, notice
+from striptools_cli.hierarchy import asked_for
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes, human_value, render
 from striptools_cli.streams import (
@@ -46,6 +55,7 @@ from striptools_cli.streams import (
 _CLEAN = CleanOptions()
 _ORDER = OrderingOptions()
 _OPTIONS = Options()
+_HIERARCHY = HierarchyOptions()
 
 _SAID_OF_COUNTS = {
     "non_finite": "dropped {} with a non-finite vertex|face|faces",
@@ -114,6 +124,45 @@ def run(
             metavar="D",
             help="The coarsest grid that moves no vertex by more than D, or Drel diagonals, like 1e-4rel.",
             show_default="keep every bit",
+        ),
+    ] = None,
+    hierarchy: Annotated[
+        str,
+        typer.Option(metavar="NAME", help=f"What rays are to walk: {', '.join(get_args(HierarchyName))}."),
+    ] = _HIERARCHY.name,
+    over: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help=f"What its leaves hold: {', '.join(get_args(OverName))}; blocks not for kdtree "
+            "(slbvh, kdtree, loose-octree).",
+            show_default="triangles",
+        ),
+    ] = None,
+    levels: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=MOST_LEVELS,
+            metavar="N",
+            help="Plain SAH levels above presorted trees (presorted).",
+            show_default=str(_HIERARCHY.levels),
+        ),
+    ] = None,
+    balance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help=f"How its halves are found: {', '.join(get_args(BalanceName))} (slbvh).",
+            show_default=_HIERARCHY.balance,
+        ),
+    ] = None,
+    metric: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help=f"Its surface area metric: {', '.join(get_args(MetricName))}, with mail-boxes (kdtree).",
+            show_default=_HIERARCHY.metric,
         ),
     ] = None,
     boxes: Annotated[
@@ -207,6 +256,7 @@ def run(
             flips,
         ),
         precision=_precision(bits, max_error),
+        hierarchy=asked_for(hierarchy, over, levels, balance, metric),
         boxes=boxes,
         remap=not no_remap,
         threads=threads,

@@ -5,9 +5,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from striptools.reducem.check_hierarchy import hierarchy_depth
 from striptools.reducem.layout import VERSION
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene
+from striptools.reducem.stored_hierarchy import name_of, over_of
 from striptools_cli import log
 from striptools_cli.report import Format, render
 from striptools_cli.streams import Source, say
@@ -24,6 +26,7 @@ def run(
     for a strip of n triangles, `flips` the triangles that run against their strip. `bytes_per_triangle` is
     what tracing needs, so every part but the remap and attributes, before compression;
     `resident_bytes_per_triangle` what a tracer holds that traces the blocks as they are, boxes and all.
+    `hierarchy` is what rays walk; of another one than reducem `depth` counts the nodes on its longest way.
     Where a scene has instances all of that is of the geometries, stored once; `placed_triangles` are those
     of all instances.
     """
@@ -48,20 +51,43 @@ def describe(scene: Scene) -> dict[str, object]:
         "vertices_per_triangle": _share(len(scene.vertices), triangles),
         "blocks": blocks,
         "triangles_per_block": _share(triangles, blocks),
-        "boxes": scene.boxes,
+        **_hierarchy(scene),
         "bytes_per_triangle": scene.bytes_per_triangle(),
-        "resident_bytes_per_triangle": scene.resident_bytes_per_triangle(),
+        **_resident(scene),
         "bytes": {**parts, "total": sum(parts.values())},
         "bytes_per_triangle_by_part": {part: _share(size, triangles) for part, size in parts.items()},
         **_carried(scene),
         "precision": _precision(scene),
-        "axes": _axes(scene),
+        **({} if scene.triangles is not None else {"axes": _axes(scene)}),
         "format_version": f"{VERSION[0]}.{VERSION[1]}",
         "remap": scene.remap is not None,
         "source_faces": scene.source_face_count,
         "bounds": {"lowest": scene.low.tolist(), "highest": scene.high.tolist()},
         "metadata": {_printable(name): _printable(str(value)) for name, value in scene.metadata.items()},
     }
+
+
+def _hierarchy(scene: Scene) -> dict[str, object]:
+    """What rays walk: the default hierarchy, or what stands in its place."""
+    parts, found = scene.part_bytes(), scene.hierarchy
+    if found is None:
+        size = parts["top_level"] + parts["in_block_hierarchy"]
+        facts: dict[str, object] = {"name": "reducem", "nodes": len(scene.packed.nodes)}
+        kind: dict[str, object] = {"boxes": scene.boxes}
+    else:
+        size, over = parts["hierarchy"], over_of(found)
+        facts = {"name": name_of(found), "over": over, "objects": len(scene.objects(over)) - 1}
+        facts |= {"nodes": len(found.nodes), "depth": hierarchy_depth(found)}
+        kind = {}
+    facts |= {"bytes": size, "bytes_per_triangle": _share(size, scene.triangle_count)}
+    return {**kind, "hierarchy": facts}
+
+
+def _resident(scene: Scene) -> dict[str, object]:
+    """What a tracer holds that traces the blocks as they are; other hierarchies are traced expanded alone."""
+    if scene.hierarchy is not None:
+        return {}
+    return {"resident_bytes_per_triangle": scene.resident_bytes_per_triangle()}
 
 
 def _carried(scene: Scene) -> dict[str, object]:

@@ -1,6 +1,8 @@
 """`striptools study`: repeat a table of the literature on a model of one's own."""
 
 import dataclasses
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +13,9 @@ from striptools.measure.plots import plot_study, require_plots
 from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range, study_strips
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
+from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options
+from striptools.stopwatch import Watch
 from striptools.strips.ordering import OrderingOptions
 from striptools.trace.device import DeviceKind
 from striptools_cli import log, notice
@@ -19,12 +23,14 @@ from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import STANDARD, Source, input_format, say
 
-Subject = Literal["strips"]
+Subject = Literal["strips", "presorted", "slbvh", "kdtree", "loose-octree", "hierarchies"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 _DEFAULTS = StudyOptions()
 _ORDER = OrderingOptions()
 _QUICK = {"side": 128, "runs": 3}
+_MODULES = {"loose-octree": "study_loose"}
+"""Of `striptools.measure`, for the subjects whose module is not named after them."""
 
 
 def run(
@@ -33,7 +39,7 @@ def run(
     out: Annotated[
         str | None,
         typer.Option(
-            metavar="DIR", help="Write MODEL-strips.png (a plot) and .csv there.", show_default="no"
+            metavar="DIR", help="Write MODEL-SUBJECT.png (a plot) and .csv there.", show_default="no"
         ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs: a first impression.")] = False,
@@ -65,11 +71,12 @@ def run(
     form: Annotated[Format, typer.Option("--format", help="How to print the tables.")] = "text",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and tables.")] = False,
 ) -> None:
-    """Compare what stripifiers make of a mesh, all else being equal.
+    """Compare what methods make of a mesh, all else being equal, and what their papers say.
 
-    `study strips` repeats Table 3.2 of the Strip-RT paper: memory and traced rays a second of the same scene
+    `strips` repeats Table 3.2 of the Strip-RT paper: memory and traced rays a second of the same scene
     with strips by Strip-RT, by a STRIPE-like greedy and by Tipsify, beside the paper's own ratios and the
-    strips' quality. Needs the extra trace, and with --out the extra plots.
+    strips' quality. `presorted`, `slbvh`, `kdtree` and `loose-octree` do the like for those hierarchies, and
+    `hierarchies` puts all of them into one table. Needs the extra trace, and with --out the extra plots.
     """
     log.set_up(quiet=quiet)
     folder = None if out is None else _folder(out)
@@ -85,15 +92,58 @@ def run(
     source = load_mesh(file.file, file_format=input_format(file, from_format) or None)
     notice.before_tracing(quiet=quiet)
     with StageProgress(quiet=quiet) as progress:
-        study = study_strips(source, options, watch=progress.watch)
-    say(printed(study, form, file.title))
+        done = (_strips_done if subject == "strips" else _other_done)(
+            subject, source, options, progress.watch
+        )
+    say(done.printed(form, file.title))
     if folder is not None:
         stem = "standard-input" if mesh == STANDARD else Path(file.title).stem
         picture = folder / f"{stem}-{subject}.png"
-        plot_study(study, picture, file.title)
-        write_atomically(picture.with_suffix(".csv"), printed(study, "csv", "").encode())
+        table = picture.with_suffix(".csv")
+        if done.plot is not None:
+            done.plot(picture, file.title)
+        write_atomically(table, done.printed("csv", "").encode())
         if not quiet:
-            say(f"written: {picture} and {picture.with_suffix('.csv').name}\n", error=True)
+            written = table if done.plot is None else f"{picture} and {table.name}"
+            say(f"written: {written}\n", error=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Done:
+    """A study that is done: what prints it by a format and a title, and what draws it, if anything does."""
+
+    printed: Callable[[Format, str], str]
+    plot: Callable[[Path, str], object] | None
+
+
+def _strips_done(_subject: Subject, source: Mesh, options: StudyOptions, watch: Watch) -> _Done:
+    study = study_strips(source, options, watch=watch)
+    return _Done(
+        lambda form, title: printed(study, form, title), lambda path, title: plot_study(study, path, title)
+    )
+
+
+def _other_done(subject: Subject, source: Mesh, options: StudyOptions, watch: Watch) -> _Done:
+    """A study whose module has `study`, `tables`, and maybe `plot`."""
+    module = import_module(f"striptools.measure.{_MODULES.get(subject, f'study_{subject}')}")
+    study = module.study(source, options, watch=watch)
+    plot = getattr(module, "plot", None)
+    return _Done(
+        lambda form, title: printed_tables(module.tables(study), form, title),
+        None if plot is None else lambda path, title: plot(study, path, title),
+    )
+
+
+Tables = list[tuple[str, list[dict[str, object]]]]
+
+
+def printed_tables(tables: Tables, form: Format, title: str) -> str:
+    """Tables as text, json, csv or md, one after another; those of csv have an empty line between them."""
+    if form == "json":
+        return render({"tables": [{"title": name, "rows": rows} for name, rows in tables]}, "json")
+    heading = f"{title}: " if title else ""
+    parts = [render_table(rows, form, heading + name) for name, rows in tables if rows]
+    return "\n".join(parts)
 
 
 def printed(study: Study, form: Format, title: str) -> str:

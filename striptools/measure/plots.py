@@ -17,6 +17,7 @@ from striptools.mesh.atomic import write_atomically, write_stream
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK = {"strip-rt": "#1b6ca8", "paper": "#7fb2d6", "stripe": "#c8553d", "tipsify": "#e0a030"}
 """A colour for each method."""
@@ -60,6 +61,15 @@ def plot_study(study: Study, target: str | Path | IO[bytes], title: str = "") ->
     _plot_lengths(lengths, study)
     name = f"{title}: " if title else ""
     figure.suptitle(f"{name}{study.triangles:,} triangles, stripifiers under the same representation")
+    return save_figure(figure, target)
+
+
+def save_figure(figure: "Figure", target: str | Path | IO[bytes]) -> int:
+    """Write a figure as a PNG picture, whole or not at all; gives the bytes written.
+
+    Raises:
+        WriteError: The file could not be written.
+    """
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     data = buffer.getvalue()

@@ -19,7 +19,7 @@ from striptools.partition.sah import PartitionOptions, expected_cost, half_area
 from striptools.reducem.scene import Scene
 from striptools.strips.ordering import Sequences
 from striptools.strips.topology import RESTART, Strips, classic_strips
-from striptools.types import Bools, Boxes, Counts, RayVectors
+from striptools.types import Bools, Boxes, Counts, FaceIds, RayVectors
 
 if TYPE_CHECKING:
     from striptools.trace import Tracer
@@ -114,12 +114,20 @@ def strip_quality(
 
 
 def quality_tree(scene: Scene, triangle_boxes: Boxes, *, threads: int = 1) -> BinaryTree:
-    """The binary tree that `StripQuality.cost` is the cost of; its triangles are in an order of its own.
+    """The binary tree that `StripQuality.cost` is the cost of; arguments as for `in_strip_tree`."""
+    return in_strip_tree(scene, triangle_boxes, threads=threads)[1]
+
+
+def in_strip_tree(scene: Scene, triangle_boxes: Boxes, *, threads: int = 1) -> tuple[FaceIds, BinaryTree]:
+    """The implicit trees inside strips, balanced, under SAH trees over strips and blocks.
 
     Args:
         scene: Of at least one triangle.
         triangle_boxes: (n, 6) float32, in file order.
         threads: Threads of the split over blocks.
+
+    Returns:
+        (n,) int32, the triangle in file order that each leaf has; and the tree, one triangle a leaf.
     """
     lengths = np.diff(scene.starts)
     block_strips = np.searchsorted(scene.starts, scene.block_starts).astype(np.int32)
@@ -127,7 +135,7 @@ def quality_tree(scene: Scene, triangle_boxes: Boxes, *, threads: int = 1) -> Bi
     given = (strip_boxes, lengths, block_strips, PartitionOptions())
     order, hierarchy = build_block_hierarchy(*given, threads=threads)
     places = Sequences(np.arange(len(triangle_boxes), dtype=np.int32), scene.starts).reordered(order)
-    return expand_hierarchy(hierarchy, places.starts, triangle_boxes[places.faces])
+    return places.faces, expand_hierarchy(hierarchy, places.starts, triangle_boxes[places.faces])
 
 
 def length_histogram(lengths: Counts) -> dict[int, int]:
@@ -176,8 +184,10 @@ def traversal_steps(tracer: "Tracer", origins: RayVectors, directions: RayVector
         origins: (r, 3).
         directions: (r, 3), r >= 1.
     """
-    steps = tracer.closest_hit(origins, directions, steps=True).steps
-    return 0.0 if steps is None or len(steps) == 0 else float(steps.mean(dtype=np.float64))
+    counters = tracer.closest_hit(origins, directions, counters=True).counters
+    if counters is None or len(origins) == 0:
+        return 0.0
+    return float(counters.steps.mean(dtype=np.float64))
 
 
 def _areas(boxes: Boxes, starts: Counts) -> tuple[float, float, float]:

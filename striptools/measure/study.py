@@ -167,7 +167,9 @@ class Study:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class RaySet:
+    """Rays to trace."""
+
     origins: RayVectors
     directions: RayVectors
 
@@ -201,7 +203,7 @@ def study_strips(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watc
         UsageError: An option is out of its range.
     """
     options = options or StudyOptions()
-    tell = watch or _tell_no_one
+    tell = watch or tell_no_one
     orderings = variants(options.options.ordering)
     scenes: dict[str, Scene] = {}
     seconds: dict[str, float] = {}
@@ -216,9 +218,9 @@ def study_strips(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watc
     tracers = {
         name: Tracer(scene, device=options.device, threads=options.threads) for name, scene in scenes.items()
     }
-    rays = _rays(scenes[REFERENCE], tracers[REFERENCE], options)
+    rays = study_rays(scenes[REFERENCE], tracers[REFERENCE], options)
     steps = _steps(tracers, rays, tell)
-    times = _times(tracers, rays, options.runs, tell)
+    times = timed_in_turn(tracers, rays, options.runs, tell)
     quality = _qualities(scenes, options.options)
     rows = [
         _row(name, orderings[name], scenes[name], seconds[name], times, steps[name], quality[name], rays)
@@ -255,7 +257,7 @@ def _bytes(scene: Scene) -> int:
     return sum(parts.values()) - parts["remap"] - parts["attributes"]
 
 
-def _rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[_Rays, _Rays]:
+def study_rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[RaySet, RaySet]:
     """Primary rays of one camera, and a secondary one from each of their hits, towards its side."""
     camera = Camera.framing(scene.positions, width=options.side, height=options.side, up=options.up)
     origins, directions = camera_rays(camera)
@@ -270,11 +272,11 @@ def _rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[_Rays, _
     normals *= np.where((normals * way).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)
     diagonal = float(np.linalg.norm(np.ptp(scene.positions.astype(np.float64), axis=0)))
     offset = LIFT * diagonal + 2.0**-20 * np.abs(points).max(axis=1, initial=0.0)
-    return _Rays(origins, directions), _Rays(*cosine_rays(points, normals, offset=offset))
+    return RaySet(origins, directions), RaySet(*cosine_rays(points, normals, offset=offset))
 
 
 def _steps(
-    tracers: dict[str, Tracer], rays: tuple[_Rays, _Rays], tell: Watch
+    tracers: dict[str, Tracer], rays: tuple[RaySet, RaySet], tell: Watch
 ) -> dict[str, tuple[float, float]]:
     found = {}
     for done, (name, tracer) in enumerate(tracers.items()):
@@ -284,11 +286,11 @@ def _steps(
     return found
 
 
-def _times(
-    tracers: dict[str, Tracer], rays: tuple[_Rays, _Rays], runs: int, tell: Watch
+def timed_in_turn(
+    tracers: dict[str, Tracer], rays: tuple[RaySet, ...], runs: int, tell: Watch
 ) -> dict[str, np.ndarray]:
-    """(runs, 2) seconds of each variant, for primary and secondary rays; all in turn within each run."""
-    times = {name: np.zeros((runs, 2)) for name in tracers}
+    """(runs, k) seconds of each variant, for k kinds of rays; all in turn within each run."""
+    times = {name: np.zeros((runs, len(rays))) for name in tracers}
     names = list(tracers)
     # The first run compiles and warms up, and does not count.
     for run in range(-1, runs):
@@ -303,7 +305,7 @@ def _times(
     return times
 
 
-def _seconds(tracer: Tracer, rays: _Rays, part: slice) -> float:
+def _seconds(tracer: Tracer, rays: RaySet, part: slice) -> float:
     start = time.perf_counter()
     tracer.closest_hit(rays.origins[part], rays.directions[part])
     return time.perf_counter() - start
@@ -325,10 +327,10 @@ def _row(
     times: dict[str, np.ndarray],
     steps: tuple[float, float],
     quality: StripQuality,
-    rays: tuple[_Rays, _Rays],
+    rays: tuple[RaySet, RaySet],
 ) -> StudyRow:
     primary, secondary = (
-        _rate_and_ratio(len(part.origins), times[name][:, kind], times[REFERENCE][:, kind])
+        rate_and_ratio(len(part.origins), times[name][:, kind], times[REFERENCE][:, kind])
         for kind, part in enumerate(rays)
     )
     return StudyRow(
@@ -348,15 +350,15 @@ def _row(
     )
 
 
-def _rate_and_ratio(rays: int, seconds: np.ndarray, of_reference: np.ndarray) -> tuple[float, float]:
+def rate_and_ratio(rays: int, seconds: np.ndarray, of_reference: np.ndarray) -> tuple[float, float]:
     """Rays a second in the fastest run, and the reference's rate over it; 0 and 1 where there are no rays."""
     if rays == 0:
         return 0.0, 1.0
     return rays / float(seconds.min()), float(np.median(seconds / of_reference))
 
 
-def _tell_no_one(_stage: str, _fraction: float) -> None:
-    pass
+def tell_no_one(_stage: str, _fraction: float) -> None:
+    """The watch of who does not watch."""
 
 
 # Notes. Strip-RT's lead in primary / secondary rays a second and what a triangle takes, in blocks of 256:

@@ -24,6 +24,12 @@ NODE_COST = 1.0
 TRIANGLE_COST = 1.0
 """Testing the ray against one triangle, in node visits."""
 
+KD_TRIANGLE_COST = 0.5
+"""Testing one triangle of a kd-tree's leaf, in steps: what trees are fastest with, not what a test takes."""
+
+KD_STRIP_COST = 2.0
+"""Testing one strip of a kd-tree's leaf, in steps."""
+
 LARGEST_BINS = 64
 LARGEST_SWEEP = 64
 SMALLEST_BLOCK = 4
@@ -57,6 +63,47 @@ class PartitionOptions:
                 self.block,
                 f"{SMALLEST_BLOCK} to {LARGEST_BLOCK}",
             )
+
+
+@dataclass(frozen=True)
+class KdCosts:
+    """What a kd-tree's splits are weighed by: its part of the cost model.
+
+    A split costs
+
+        traversal + intersection * (P(L) C(L) + P(R) C(R) - P(L and R) C(L and R))
+
+    where C counts objects and P is the probability that a ray that meets the cell meets that side, by area;
+    the last term, for a metric corrected for mail-boxing, is Hunt's (2008): P(L and R) = (SA_L + SA_R - SA) /
+    SA. It is `1 - empty_bonus` of that where one side has no object; a leaf costs intersection * C.
+
+    Attributes:
+        traversal: One step through a node, > 0: the unit.
+        intersection: Testing one object, > 0.
+        empty_bonus: What is taken off where a side is empty, 0 to below 1.
+        depth: Depth at which no cell is split, for one object; >= 0.
+        depth_growth: How much deeper with each doubling of the objects, >= 0.
+
+    Raises:
+        UsageError: A value is out of its range.
+    """
+
+    traversal: float = 1.0
+    intersection: float = KD_TRIANGLE_COST
+    empty_bonus: float = 0.2
+    depth: float = 8.0
+    depth_growth: float = 1.3
+
+    def __post_init__(self) -> None:
+        _require(0.0 < self.traversal < np.inf, "traversal", self.traversal, "a number above 0")
+        _require(0.0 < self.intersection < np.inf, "intersection", self.intersection, "a number above 0")
+        _require(0.0 <= self.empty_bonus < 1.0, "empty_bonus", self.empty_bonus, "0 to below 1")
+        _require(0.0 <= self.depth <= 64.0, "depth", self.depth, "0 to 64")
+        _require(0.0 <= self.depth_growth <= 64.0, "depth_growth", self.depth_growth, "0 to 64")
+
+    def deepest(self, objects: int) -> int:
+        """The depth at which no cell of a tree over so many objects is split."""
+        return int(self.depth + self.depth_growth * np.log2(max(objects, 1)))
 
 
 def half_area(boxes: Boxes) -> Doubles:

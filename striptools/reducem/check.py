@@ -6,15 +6,20 @@ from typing import Any
 import numpy as np
 
 from striptools.errors import LimitError, UnreadableSceneError, UsageError
+from striptools.hierarchies.kdtree import KdTree
 from striptools.hierarchies.packed import check_packed
+from striptools.hierarchies.presorted import Presorted
 from striptools.kernels import scene as kernels
 from striptools.mesh.attributes import Domain
 from striptools.reducem import layout
 from striptools.reducem.attributes import check_columns
 from striptools.reducem.blocks import check_headers, described_runs
+from striptools.reducem.check_hierarchy import check_hierarchy
 from striptools.reducem.geometries import check_faces, check_geometries, check_instance_rules
 from striptools.reducem.issues import unreadable
+from striptools.reducem.plain_triangles import check_triangles
 from striptools.reducem.scene import Remap, Scene, bounds_of
+from striptools.reducem.stored_hierarchy import items_of
 from striptools.types import FaceIds
 
 __all__ = ["check_limits", "check_nodes", "check_remap", "check_scene"]
@@ -80,8 +85,11 @@ def check_scene(scene: Scene, where: str = "scene") -> None:
     check_limits(scene)
     _check_dtypes(scene)
     check_record(scene, where)
+    check_parts(scene, where)
     if scene.block_count:
         check_headers(scene.blocks, scene.triangle_count, where)
+    if scene.triangles is not None:
+        check_triangles(scene.triangles, where)
     _check_positions(scene, where)
     check_placing(scene, where)
     check_nodes(scene, where)
@@ -109,7 +117,7 @@ def check_record(scene: Scene, where: str) -> None:
         raise unreadable("RDM205", place)
     if any(int(cell) not in layout.CELL_EXPONENTS for cell in scene.grid.cell):
         raise unreadable("RDM206", place)
-    if scene.block_count == 0 and (
+    if scene.triangle_count == 0 and (
         scene.low.any() or scene.high.any() or scene.grid.cell.any() or scene.origin is not None
     ):
         raise unreadable("RDM208", place)
@@ -137,7 +145,7 @@ def check_placing(scene: Scene, where: str) -> None:
         if geometries is not None or instances is not None:
             raise unreadable("RDM113", f"{where}: {'GEOM' if geometries is None else 'INST'}")
         return
-    if scene.block_count == 0:
+    if scene.block_count == 0 or scene.hierarchy is not None:
         raise unreadable("RDM117", f"{where}: GEOM")
     starts = (geometries, scene.roots, scene.blocks.triangle_starts)
     check_geometries(*starts, scene.source_face_count, where)
@@ -146,15 +154,33 @@ def check_placing(scene: Scene, where: str) -> None:
         check_faces(*starts, scene.remap.face, where)
 
 
+def check_parts(scene: Scene, where: str) -> None:
+    """Make sure that plain triangles stand in the place of blocks where the hierarchy asks for it.
+
+    Raises:
+        UnreadableSceneError: They do not.
+    """
+    is_plain = scene.triangles is not None
+    if scene.hierarchy is not None and scene.triangle_count == 0:
+        raise unreadable("RDM117", f"{where}: HIER")
+    if is_plain != isinstance(scene.hierarchy, Presorted):
+        raise unreadable("RDM117" if is_plain else "RDM113", f"{where}: TRIS")
+    if is_plain and scene.block_count:
+        raise unreadable("RDM201", f"{where}: SCEN")
+
+
 def check_nodes(scene: Scene, where: str) -> None:
     """Make sure that the hierarchy reaches everything once and that its boxes hold what is below them.
 
     Raises:
         UnreadableSceneError: It does not.
     """
-    if scene.block_count == 0:
+    if scene.block_count == 0 or scene.hierarchy is not None:
         if len(scene.packed.nodes) or scene.packed.runs is not None:
-            raise unreadable("RDM208", f"{where}: SCEN")
+            raise unreadable("RDM208" if scene.triangle_count == 0 else "RDM201", f"{where}: SCEN")
+        # What a file holds was looked at when it was asked for.
+        if scene.hierarchy is not None and scene.__dict__.get("_sound") is not scene.hierarchy:
+            check_hierarchy(scene, scene.hierarchy, where)
         return
     given = (scene.grid, scene.triangle_boxes(), scene.block_starts, scene.starts, scene.roots)
     try:
@@ -220,6 +246,7 @@ def _check_dtypes(scene: Scene) -> None:
     if scene.instances is not None:
         names = (("geometry", np.uint32), ("first_face", np.uint32), ("matrix", np.float64))
         wanted += [(f"instances.{name}", getattr(scene.instances, name), kind) for name, kind in names]
+    wanted += _alternative_dtypes(scene)
     if scene.remap is not None:
         wanted += [
             ("remap.face", scene.remap.face, np.int32),
@@ -228,6 +255,19 @@ def _check_dtypes(scene: Scene) -> None:
     for name, array, dtype in wanted:
         if array is not None and array.dtype != dtype:
             raise UsageError(f"{name} has dtype {array.dtype}, not {np.dtype(dtype)}", where="scene")
+
+
+def _alternative_dtypes(scene: Scene) -> list[tuple[str, np.ndarray | None, type]]:
+    """What the arrays of another hierarchy and of plain triangles must be."""
+    wanted: list[tuple[str, np.ndarray | None, type]] = []
+    if scene.triangles is not None:
+        wanted.append(("triangles.positions", scene.triangles.positions, np.float32))
+        wanted.append(("triangles.faces", scene.triangles.faces, np.int32))
+    if scene.hierarchy is not None:
+        is_tree = isinstance(scene.hierarchy, KdTree)
+        wanted.append(("hierarchy.nodes", scene.hierarchy.nodes, np.uint32))
+        wanted.append(("hierarchy's items", items_of(scene.hierarchy), np.uint32 if is_tree else np.int32))
+    return wanted
 
 
 def _check_attributes(scene: Scene, where: str) -> None:
@@ -250,7 +290,7 @@ def _check_positions(scene: Scene, where: str) -> None:
         return
     row = kernels.first_row_off_grid(scene.positions, math.ldexp(1.0, -scene.grid_exponent))
     if row >= 0:
-        raise unreadable("RDM204", f"{where}: BLKD: vertex {row}")
+        raise unreadable("RDM204", f"{where}: {'BLKD' if scene.block_count else 'TRIS'}: vertex {row}")
 
 
 def _has_repeat(face: FaceIds, source_face_count: int) -> bool:

@@ -1,7 +1,8 @@
 """Every flaw of a scene file, by a code that users can cite; formats/reducem/ISSUES.md lists the same.
 
 Codes: 0 the file, 1 the container, 2 the scene record, 5 the remap, 52 attributes, 53 materials,
-54 geometries, 55 instances, 6 blocks, 7 nodes, 8 runs, 9 metadata. Those of 3 and 4 belonged to formats
+54 geometries, 55 instances, 56 hierarchies of other kinds, 57 plain triangles, 6 blocks, 7 nodes, 8 runs,
+9 metadata. Those of 3 and 4 belonged to formats
 before 0.3 and are not used again.
 """
 
@@ -118,6 +119,23 @@ _ALL = (
     _flaw("RDM552", "4.11", "a matrix is not finite, or its determinant is zero"),
     _flaw("RDM553", "4.11", "an instance reaches too far for float32"),
     _flaw("RDM554", "4.11", "the faces of an instance are out of their order, or too many"),
+    _flaw("RDM561", "4.12", "the hierarchy is of no kind that is known, or over what it cannot be over"),
+    _flaw("RDM562", "4.12", "the nodes or items of the hierarchy are not as many as there must be"),
+    _flaw("RDM563", "4.12", "a node of the hierarchy is not sound by itself"),
+    _flaw("RDM564", "4.12", "a node of the hierarchy is not where its parent has it, or has none"),
+    _flaw("RDM565", "4.12", "the hierarchy is more than 128 nodes deep"),
+    _flaw(
+        "RDM566",
+        "4.12",
+        "a place, reference or tree is not in exactly one leaf of the hierarchy, or not in turn",
+    ),
+    _flaw("RDM567", "4.12", "the items of the hierarchy do not name what they must, or not in their order"),
+    _flaw("RDM568", "4.12", "a box, cell or pair of triangles does not hold what is below it"),
+    _flaw("RDM571", "4.13", "a triangle names no vertex that is there"),
+    _flaw("RDM572", "4.13", "the vertices of plain triangles are not in the order of their first use"),
+    _flaw("RDM573", "4.13", "a vertex of plain triangles is not used"),
+    _flaw("RDM574", "4.13", "a plain triangle names one vertex twice"),
+    _flaw("RDM575", "4.13", "a coordinate of plain triangles is not a finite number"),
     _flaw("RDM601", "4.2", "a block does not begin at the triangle where the one before it ends"),
     _flaw("RDM602", "4.2", "the data of a block do not begin where those before them end"),
     _flaw("RDM603", "4.2", "a block has fewer than 3 vertices, or more strips than triangles"),

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from striptools.hierarchies.options import HierarchyName
 from striptools.hierarchies.packed import NodeWords, Roots, join_tops
 from striptools.mesh.instances import FARTHEST, Geometries, placed_bounds, reach
 from striptools.mesh.mesh import Mesh
@@ -83,11 +84,13 @@ def stored_instances(
     )
 
 
-def why_not_kept(mesh: Mesh) -> str | None:
+def why_not_kept(mesh: Mesh, hierarchy: HierarchyName = "reducem") -> str | None:
     """Why a scene cannot keep the instances of a mesh, in words, or None where it can.
 
     Far from zero, measured by its size, a flattened mesh is given an origin, which instances would not have.
     """
+    if hierarchy != "reducem":
+        return f"{hierarchy} has no two-level form"
     assert mesh.geometries is not None
     assert mesh.instances is not None
     matrix, bounds = mesh.instances.matrix, mesh.bounds

@@ -49,6 +49,9 @@ CELL_EXPONENTS = range(-149, 128)
 INSTANCE_LIMIT = 2**24
 METADATA_LIMIT = 2**20
 MATERIALS_LIMIT = 2**22
+DEEPEST_HIERARCHY = 128
+"""The most nodes on a way down a hierarchy of a section of its own."""
+
 ATTRIBUTES_HEAD = 8
 """Bytes before the records of the attributes: how many there are, and a reserved word."""
 
@@ -206,7 +209,39 @@ INSTANCE = _record(
     ("<u4", "first_face"),
     ("12<f8", "matrix"),
 )
-RECORDS = (HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD, ATTRIBUTE, GEOMETRY, INSTANCE)
+HIERARCHY_RECORD = _record(
+    "hierarchy record",
+    ("u1", "kind"),
+    ("u1", "over"),
+    ("u1", "flags"),
+    ("u1", "reserved"),
+    ("<u4", "node_count"),
+    ("<u4", "item_count"),
+    ("<u4", "reserved_2"),
+    ("<f4", "low_x"),
+    ("<f4", "low_y"),
+    ("<f4", "low_z"),
+    ("<f4", "high_x"),
+    ("<f4", "high_y"),
+    ("<f4", "high_z"),
+    ("24u1", "reserved_3"),
+)
+BOX_NODE = _record(
+    "node with a box",
+    ("<f4", "low_x"),
+    ("<f4", "low_y"),
+    ("<f4", "low_z"),
+    ("<f4", "high_x"),
+    ("<f4", "high_y"),
+    ("<f4", "high_z"),
+    ("<u4", "a"),
+    ("<u4", "b"),
+)
+CELL_NODE = _record("node with a split", ("<u4", "a"), ("<u4", "b"))
+RECORDS = (
+    *(HEADER, ENTRY, SCENE_RECORD, BLOCK_HEADER, NODE_RECORD, ATTRIBUTE, GEOMETRY, INSTANCE),
+    *(HIERARCHY_RECORD, BOX_NODE, CELL_NODE),
+)
 
 SCENE = Section(b"SCEN", True)
 BLOCK_HEADERS = Section(b"BLKH", True)
@@ -219,16 +254,21 @@ REMAP = Section(b"RMAP", False)
 ATTRIBUTES = Section(b"ATTR", False)
 MATERIALS = Section(b"MATL", False)
 METADATA = Section(b"META", False)
+HIERARCHY = Section(b"HIER", True)
+TRIANGLES = Section(b"TRIS", True)
 SECTIONS = (
     *(SCENE, BLOCK_HEADERS, BLOCK_DATA, NODES, RUNS, REMAP, ATTRIBUTES, MATERIALS, METADATA),
-    *(GEOMETRIES, INSTANCES),
+    *(GEOMETRIES, INSTANCES, HIERARCHY, TRIANGLES),
 )
 """In the order in which the writer puts them."""
 
 RAW = (SCENE, INSTANCES)
 """Those that must not be packed: what bounds the length of others, and what no count bounds."""
 
-PLANE_WIDTHS = {BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 4, REMAP.kind: 4}
+PLANE_WIDTHS = {
+    **{BLOCK_HEADERS.kind: 32, NODES.kind: 64, RUNS.kind: 4, REMAP.kind: 4},
+    **{HIERARCHY.kind: 4, TRIANGLES.kind: 4},
+}
 """Bytes of a record for the kinds of sections that may have the codec of planes."""
 
 
@@ -250,6 +290,8 @@ PARTS = (
     "remap",
     "attributes",
     "instances",
+    "triangles",
+    "hierarchy",
     "container",
 )
 """What the bytes of a file are counted by; instances are geometries too; container is header, table, scene
@@ -269,6 +311,16 @@ def remap_length(triangles: int) -> int:
 def most_attribute_bytes(triangles: int) -> int:
     """The most bytes of the attributes of so many triangles: four kinds with a row a corner, and more."""
     return 256 * (triangles + 1)
+
+
+def most_hierarchy_bytes(triangles: int) -> int:
+    """The most bytes of the hierarchy over so many triangles."""
+    return 1024 * (triangles + 1)
+
+
+def triangle_lengths(triangles: int) -> tuple[int, int]:
+    """The least and the most bytes of so many plain triangles: with three vertices, with three for each."""
+    return 12 * (triangles + 3), 48 * triangles
 
 
 def section_lengths(

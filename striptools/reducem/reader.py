@@ -14,6 +14,7 @@ import os
 import re
 import stat
 import zlib
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +23,13 @@ from typing import IO, Any
 import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid, PackedNodes
+from striptools.hierarchies.stored import StoredHierarchy
 from striptools.mesh.attributes import Domain, Material
 from striptools.reducem import check, layout
 from striptools.reducem.archive import expanded, expanded_blocks
 from striptools.reducem.attributes import Column, check_columns, check_materials, decode_columns
 from striptools.reducem.blocks import Blocks, check_headers
+from striptools.reducem.check_hierarchy import check_hierarchy
 from striptools.reducem.geometries import (
     SceneGeometries,
     SceneInstances,
@@ -38,7 +41,9 @@ from striptools.reducem.geometries import (
     roots_of,
 )
 from striptools.reducem.issues import unreadable
+from striptools.reducem.plain_triangles import PlainTriangles, decode_triangles
 from striptools.reducem.scene import Remap, Scene
+from striptools.reducem.stored_hierarchy import decode_hierarchy
 
 __all__ = ["PIECE", "open_scene", "read_scene"]
 
@@ -175,23 +180,19 @@ class _File:
 
     def load(self, name: str, scene: Scene) -> object:
         """A field of the scene, checked."""
-        if name == "blocks":
-            return self.blocks()
-        if name == "packed":
-            return self.packed(scene)
-        if name == "remap":
-            return self.remap()
-        if name == "columns":
-            return self.columns(scene)
-        if name == "materials":
-            return self.materials()
-        if name == "metadata":
-            return self.metadata()
-        if name == "geometries":
-            return self.geometries(scene)
-        if name == "instances":
-            return self.instances(scene)
-        return self.of_record(name)
+        loaders: dict[str, Callable[[], object]] = {
+            "blocks": self.blocks,
+            "packed": lambda: self.packed(scene),
+            "remap": self.remap,
+            "columns": lambda: self.columns(scene),
+            "materials": self.materials,
+            "metadata": self.metadata,
+            "geometries": lambda: self.geometries(scene),
+            "instances": lambda: self.instances(scene),
+            "triangles": self.triangles,
+            "hierarchy": lambda: self.hierarchy(scene),
+        }
+        return loaders[name]() if name in loaders else self.of_record(name)
 
     def check(self, scene: Scene) -> None:
         """Check all: the sections, those that are passed over too, and what they hold."""
@@ -248,7 +249,7 @@ class _File:
         record = {field.name: row[field.name].tolist() for field in layout.SCENE_RECORD.fields}
         if record["triangle_count"] == 0 and raw[_BOUNDS].any():
             raise unreadable("RDM208", f"{self.where}: SCEN")
-        _check_record(record, layout.GEOMETRIES.kind in self.entries, f"{self.where}: SCEN")
+        _check_record(record, self.entries.keys(), f"{self.where}: SCEN")
         if record["triangle_count"] > MOST_TRIANGLES or record["source_face_count"] > 2**31 - 1:
             raise unreadable("RDM124", f"{self.where}: SCEN")
         return record
@@ -358,7 +359,8 @@ class _File:
     def geometries(self, scene: Scene) -> SceneGeometries | None:
         """The geometries, checked."""
         size, record = layout.GEOMETRY.size, self.record
-        raw = self.section(layout.GEOMETRIES, 0, size * record["block_count"])
+        is_other = layout.HIERARCHY.kind in self.entries
+        raw = self.section(layout.GEOMETRIES, 0, 0 if is_other else size * record["block_count"])
         self.check_both()
         if not len(raw):
             return None
@@ -375,7 +377,8 @@ class _File:
     def instances(self, scene: Scene) -> SceneInstances | None:
         """The instances, checked."""
         size = layout.INSTANCE.size
-        most = size * layout.INSTANCE_LIMIT if self.record["triangle_count"] else 0
+        is_other = layout.HIERARCHY.kind in self.entries
+        most = size * layout.INSTANCE_LIMIT if self.record["triangle_count"] and not is_other else 0
         raw = self.section(layout.INSTANCES, 0, most)
         geometries = scene.geometries
         if geometries is None:
@@ -391,6 +394,25 @@ class _File:
         there = [section.kind in self.entries for section in (layout.GEOMETRIES, layout.INSTANCES)]
         if any(there) and not all(there):
             raise unreadable("RDM113", f"{self.where}: {'INST' if there[0] else 'GEOM'}")
+
+    def triangles(self) -> PlainTriangles | None:
+        """The plain triangles, checked by themselves."""
+        if layout.TRIANGLES.kind not in self.entries:
+            return None
+        count = self.record["triangle_count"]
+        raw = self.section(layout.TRIANGLES, *(layout.triangle_lengths(count) if count else (0, 0)))
+        return decode_triangles(raw, count, self.where)
+
+    def hierarchy(self, scene: Scene) -> StoredHierarchy | None:
+        """A hierarchy other than the default one, checked against the triangles."""
+        if layout.HIERARCHY.kind not in self.entries:
+            return None
+        count = self.record["triangle_count"]
+        most = layout.most_hierarchy_bytes(count) if count else 0
+        found = decode_hierarchy(self.section(layout.HIERARCHY, min(1, count), most), self.where)
+        check_hierarchy(scene, found, self.where)
+        scene.__dict__["_sound"] = found
+        return found
 
     def json(self, raw: np.ndarray, kind: str, malformed: str, deep: str) -> Any:
         """The JSON of a section; `malformed` and `deep` are the codes of what may be wrong with it."""
@@ -469,8 +491,10 @@ _BOUNDS = slice(40, 70)
 _KNOWN = {section.kind: section for section in layout.SECTIONS}
 
 
-def _check_record(record: dict[str, Any], has_geometries: bool, place: str) -> None:
+def _check_record(record: dict[str, Any], kinds: Collection[bytes], place: str) -> None:
     """Make sure that the counts agree with each other; the numbers are looked at with the scene's fields."""
+    has_geometries, is_plain = layout.GEOMETRIES.kind in kinds, layout.TRIANGLES.kind in kinds
+    has_hierarchy = layout.HIERARCHY.kind in kinds
     names = ("triangle_count", "block_count", "node_count", "top_count", "run_count", "source_face_count")
     n, b, m, top, r, faces = (record[name] for name in names)
     stored = record["flags"] & layout.BOXES_STORED
@@ -482,9 +506,11 @@ def _check_record(record: dict[str, Any], has_geometries: bool, place: str) -> N
     if n == 0 and record["flags"] & (layout.BOXES_STORED | layout.HAS_ORIGIN):
         raise unreadable("RDM208", place)
     nodes = m >= top + b if stored else m == top
-    counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0) and b <= n <= layout.BLOCK_TRIANGLES * b
+    most = 2**32 if is_plain else layout.BLOCK_TRIANGLES * b
+    counts = b <= layout.BLOCK_LIMIT and (b == 0) == (n == 0 or is_plain) and b <= n <= most
     runs = b <= r <= n if stored else r == 0
-    tops = top == 0 if b < 2 else top > 0 or has_geometries
+    tops = top == 0 if b < 2 or has_hierarchy else top > 0 or has_geometries
+    nodes = nodes and not (has_hierarchy and stored)
     if not (counts and m <= layout.NODE_LIMIT and nodes and tops and runs and faces >= n):
         raise unreadable("RDM201", place)
     if not record["flags"] & layout.ON_GRID and record["grid_exponent"]:

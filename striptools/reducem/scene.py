@@ -9,7 +9,9 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from striptools.hierarchies.options import HierarchyOptions, OverName
 from striptools.hierarchies.packed import BoxGrid, PackedNodes, Roots, box_grid, build_inner
+from striptools.hierarchies.stored import StoredHierarchy
 from striptools.mesh.attributes import Attribute, Material, follow
 from striptools.mesh.clean import weld_vertices
 from striptools.mesh.instances import Geometries, Instances
@@ -20,6 +22,7 @@ from striptools.reducem.attributes import Column, columns_of
 from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, described_runs, encode_blocks
 from striptools.reducem.geometries import SceneGeometries, SceneInstances, roots_of
 from striptools.reducem.layout import LONGEST_RUN
+from striptools.reducem.plain_triangles import PlainTriangles
 from striptools.strips.topology import Strips, decode_strips
 from striptools.threads import every_core, in_chunks
 from striptools.types import Bools, Boxes, Counts, FaceIds, Faces, Positions, Rotations
@@ -74,6 +77,9 @@ class Scene:
             faces each is. Positions, bounds, boxes and `error_bound` are then in the geometries' own frames,
             before any matrix, and so are `faces`, `triangle_count` and all else here that is not placed.
         instances: Where they stand; there where `geometries` are.
+        hierarchy: What stands in the place of the default one, or None. `packed` then has no node.
+        triangles: Where the hierarchy is presorted, the geometry: there is then no block, and each triangle
+            counts as a strip.
     """
 
     blocks: Blocks
@@ -91,6 +97,8 @@ class Scene:
     origin: Origin | None = field(default_factory=lambda: None)
     geometries: SceneGeometries | None = field(default_factory=lambda: None)
     instances: SceneInstances | None = field(default_factory=lambda: None)
+    hierarchy: StoredHierarchy | None = field(default_factory=lambda: None)
+    triangles: PlainTriangles | None = field(default_factory=lambda: None)
 
     @classmethod
     def lazily(cls, load: Callable[[str, "Scene"], object], check: Callable[["Scene"], None]) -> "Scene":
@@ -114,8 +122,8 @@ class Scene:
 
     @property
     def triangle_count(self) -> int:
-        """Triangles in all blocks."""
-        return self.blocks.triangle_count
+        """Triangles in all blocks, or plain ones."""
+        return self.blocks.triangle_count if self.triangles is None else self.triangles.count
 
     @property
     def block_count(self) -> int:
@@ -149,11 +157,15 @@ class Scene:
 
     @cached_property
     def _totals(self) -> dict[str, int]:
-        return self.blocks.totals()
+        if self.triangles is None:
+            return self.blocks.totals()
+        return {"vertices": len(self.triangles.positions), "strips": self.triangles.count}
 
     @cached_property
     def decoded(self) -> Decoded:
-        """What the blocks hold, every rule checked."""
+        """What the blocks hold, or plain triangles as strips of one, every rule checked."""
+        if self.triangles is not None:
+            return self.triangles.decoded
         return decode_blocks(self.blocks, every_core(), self.__dict__.get("_where", "scene"))
 
     @property
@@ -183,11 +195,13 @@ class Scene:
 
     @property
     def block_starts(self) -> Counts:
-        """(b+1,) int32, the first triangle of each block, then n."""
+        """(b+1,) int32, the first triangle of each block, then n; plain triangles are as in one block."""
         return self.decoded.block_starts
 
     @cached_property
     def _faces(self) -> Faces:
+        if self.triangles is not None:
+            return self.triangles.faces
         return decode_strips(self.vertices, self.turns, self.starts, self.flips, threads=every_core())
 
     def faces(self) -> Faces:
@@ -215,6 +229,8 @@ class Scene:
     @cached_property
     def spans(self) -> Geometries:
         """Which triangles, in file order, and which of `positions` each geometry has."""
+        if self.triangles is not None:
+            return Geometries(self.block_starts, self.decoded.vertex_starts)
         blocks = self.roots.blocks
         return Geometries(self.block_starts[blocks], self.decoded.vertex_starts[blocks].astype(np.int32))
 
@@ -239,13 +255,21 @@ class Scene:
         """The exact box of each triangle in file order, (n, 6) float32; computed on each call."""
         return face_boxes(self.positions, self.faces(), threads or every_core())
 
+    def objects(self, over: OverName) -> Counts:
+        """(p+1,) int32: the first triangle, in file order, of each object a hierarchy is over, then n."""
+        if over == "triangles":
+            return np.arange(self.triangle_count + 1, dtype=np.int32)
+        return self.starts if over == "strips" else self.block_starts
+
     def with_boxes(self, threads: int | None = None) -> PackedNodes:
-        """The complete hierarchy: as stored, or built and kept where boxes are not stored.
+        """The complete default hierarchy: as stored, or built and kept where boxes are not stored.
+
+        A scene with another hierarchy has none.
 
         Args:
             threads: Threads to build with, None for every core; the result is the same.
         """
-        if self.packed.runs is not None or self.block_count == 0:
+        if self.packed.runs is not None or self.block_count == 0 or self.hierarchy is not None:
             return self.packed
         if "_complete" not in self.__dict__:
             self.__dict__["_complete"] = _completed(self, threads or every_core())
@@ -254,6 +278,20 @@ class Scene:
     def storing_boxes(self, threads: int | None = None) -> "Scene":
         """The same scene with the boxes inside blocks stored."""
         return self if self.block_count == 0 else replace(self, packed=self.with_boxes(threads))
+
+    def under(self, options: HierarchyOptions, threads: int | None = None) -> "Scene":
+        """The same scene under the hierarchy that is asked for.
+
+        Args:
+            options: Which one, and over what.
+            threads: Threads to build with, None for every core; the scene is the same.
+
+        Raises:
+            UsageError: The scene has instances, plain triangles, or no default hierarchy to go back to.
+        """
+        from striptools.reducem.hierarchy import scene_under
+
+        return scene_under(self, options, threads or every_core())
 
     def check(self) -> None:
         """Make sure that the scene, and the file that it was opened from, keep every rule of the format.
@@ -346,8 +384,9 @@ class Scene:
         Returns:
             Bytes of `positions`, `connectivity` (start, turn and flip bits, and indices),
             `in_block_hierarchy`, `block_headers`, `top_level`, `remap`, `attributes` (materials too),
-            `instances` (geometries too) and `container` (header, table, scene record, metadata, and what
-            fills up words and sections); their sum is the file's length.
+            `instances` (geometries too), `triangles` (plain ones), `hierarchy` (one that is not the default)
+            and `container` (header, table, scene record, metadata, and what fills up words and sections);
+            their sum is the file's length.
         """
         from striptools.reducem.writer import part_sizes
 
@@ -372,11 +411,13 @@ class Scene:
         return replace(self, columns=columns, materials=materials)
 
     def resident_bytes_per_triangle(self) -> float:
-        """Say what tracing without unpacking holds, over the triangles.
+        """Say what tracing without unpacking holds, over the triangles; 0 under another hierarchy.
 
         That is the blocks and the complete hierarchy as a file with boxes stored has them; neither the remap
         nor the few per cent by which a tracer rounds arrays up that no file holds.
         """
+        if self.hierarchy is not None:
+            return 0.0
         packed = self.with_boxes()
         held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run, packed.runs]
         return sum(array.nbytes for array in held if array is not None) / max(1, self.triangle_count)

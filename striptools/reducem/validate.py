@@ -20,17 +20,19 @@ from striptools.reducem.issues import ISSUES, Finding
 from striptools.reducem.validate_archive import content_limit, join_blocks, join_planes
 from striptools.reducem.validate_attributes import inspect_attributes, inspect_materials
 from striptools.reducem.validate_blocks import Blocks, inspect_blocks, inspect_headers
+from striptools.reducem.validate_hierarchy import inspect_hierarchy
 from striptools.reducem.validate_instances import inspect_geometries, inspect_instances, inspect_owners
 from striptools.reducem.validate_nodes import inspect_nodes
 from striptools.reducem.validate_packed import unpack
+from striptools.reducem.validate_triangles import inspect_triangles
 
 __all__ = ["validate"]
 
-_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
+_NEEDED = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST", "HIER", "TRIS")
 _PASSED_OVER = ("RMAP", "ATTR", "MATL", "META")
 _KNOWN = (*_NEEDED, *_PASSED_OVER)
-_OPTIONAL = (*_PASSED_OVER, "GEOM", "INST")
-_WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4}
+_OPTIONAL = (*_PASSED_OVER, "GEOM", "INST", "HIER")
+_WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4, "HIER": 4, "TRIS": 4}
 """Bytes of a record for the kinds that may have codec 3."""
 _MOST_METADATA = 2**20
 _MOST_MATERIALS = 2**22
@@ -201,6 +203,7 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
         inspection.found("RDM114", "SCEN", entry.at + 16)
         return False
     lengths = _lengths(*struct.unpack_from("<5I", payload), payload[24] & 1)
+    _other_hierarchy(inspection, first.pop("HIER", None), lengths)
     # Block data may lean on the headers, wherever those lie.
     for kind, entry in sorted(first.items(), key=lambda item: item[1].codec == 2):
         _decode(inspection, entry, lengths[kind])
@@ -208,6 +211,21 @@ def _sections(inspection: Inspection, entries: list[_Entry]) -> bool:
         if least and kind not in first and kind not in _OPTIONAL:
             inspection.found("RDM113", kind, 32)
     return True
+
+
+def _other_hierarchy(
+    inspection: Inspection, entry: _Entry | None, lengths: dict[str, tuple[int, int]]
+) -> None:
+    """Decode HIER where it is there, for what must be there besides follows from it."""
+    found = None
+    if entry is not None:
+        _decode(inspection, entry, lengths["HIER"])
+        lengths |= {"GEOM": (0, 0), "INST": (0, 0)}
+        found = inspection.sections.get("HIER")
+    if entry is None or (found is not None and found.data[0] != 4):
+        lengths["TRIS"] = (0, 0)
+    elif found is None:
+        lengths["TRIS"] = (0, lengths["TRIS"][1])
 
 
 def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str, tuple[int, int]]:
@@ -218,6 +236,7 @@ def _lengths(n: int, b: int, m: int, _top: int, r: int, stored: int) -> dict[str
     lengths |= {"RMAP": (remap, remap), "META": (1, _MOST_METADATA)}
     beside = {"ATTR": (1, 256 * (n + 1)), "MATL": (1, _MOST_MATERIALS)}
     beside |= {"GEOM": (16, 16 * b), "INST": (104, 104 * 2**24)}
+    beside |= {"HIER": (1, 1024 * (n + 1)), "TRIS": (12 * (n + 3), 48 * n)}
     return lengths | (beside if n else dict.fromkeys(beside, (0, 0)))
 
 
@@ -283,10 +302,13 @@ def _contents(inspection: Inspection) -> bool:
     sections = inspection.sections
     _record(inspection, sections["SCEN"])
     parts = inspect_geometries(inspection)
+    geometry = inspect_triangles(inspection) if "TRIS" in sections else None
     if "BLKH" in sections:
         geometry = inspect_blocks(inspection) if "BLKD" in sections else None
         if "NODE" in sections and parts is not None:
             inspect_nodes(inspection, geometry, parts)
+    if "HIER" in sections:
+        inspect_hierarchy(inspection, geometry)
     if "RMAP" in sections:
         _remap(inspection, sections["RMAP"])
         inspect_owners(inspection, parts)
@@ -304,7 +326,7 @@ def _beside(inspection: Inspection) -> None:
     if "MATL" in sections:
         rows = _json(inspection, sections["MATL"], "RDM531", "RDM531")
         materials = None if rows is _NO_JSON else inspect_materials(inspection, sections["MATL"], rows)
-    if "ATTR" in sections and "BLKH" in sections:
+    if "ATTR" in sections and ("BLKH" in sections or "TRIS" in sections):
         inspect_attributes(inspection, sections["ATTR"], materials)
     elif "MATL" in sections and "ATTR" not in inspection.undecoded and "ATTR" not in sections:
         inspection.found("RDM117", "MATL", sections["MATL"].offset)
@@ -315,14 +337,16 @@ def _record(inspection: Inspection, section: Section) -> None:
     n, b, m, top, r, source_faces, flags, reserved, grid = struct.unpack_from("<6IBBh", section.data)
     reserved_2 = section.data[28:32] != bytes(4)
     *cells, longest = struct.unpack_from("<3hH", section.data, 64)
-    stored, several = flags & 1, "GEOM" in inspection.sections or "GEOM" in inspection.undecoded
+    there = inspection.sections.keys() | inspection.undecoded
+    stored, several, is_plain, is_other = flags & 1, "GEOM" in there, "TRIS" in there, "HIER" in there
     for at, wrong in ((24, flags > 7), (25, reserved), (28, reserved_2)):
         if wrong:
             inspection.found("RDM107", "SCEN", section.at(at))
     counts = (
-        (4, b > 2**24 or (b == 0) != (n == 0) or not b <= n <= 256 * b),
+        (4, b > 2**24 or (b == 0) != (n == 0 or is_plain) or not b <= n <= (n if is_plain else 256 * b)),
         (8, m > 2**28 or (m < top + b if stored else m != top)),
-        (12, top > 0 if b < 2 else top == 0 and not several),
+        (12, top > 0 if b < 2 or is_other else top == 0 and not several),
+        (24, stored and is_other),
         (16, not b <= r <= n if stored else r),
         (20, source_faces < n),
     )

@@ -37,7 +37,7 @@ def inspect_attributes(inspection: Inspection, section: Section, materials: int 
     """Look at the attributes.
 
     Args:
-        inspection: Of a file whose section BLKH is there.
+        inspection: Of a file whose section BLKH or TRIS is there.
         section: ATTR.
         materials: How many materials there are; None where there is no saying.
     """
@@ -57,8 +57,7 @@ def inspect_attributes(inspection: Inspection, section: Section, materials: int 
     if len({record.name for record in records}) < count:
         inspection.found("RDM521", "ATTR: a name twice", section.at(8))
     triangles = struct.unpack_from("<I", inspection.sections["SCEN"].data)[0]
-    headers = np.frombuffer(inspection.sections["BLKH"].data, np.uint8).reshape(-1, 32)
-    entries = (int(headers[:, 9].astype(np.int64).sum()) + len(headers), 3 * triangles, triangles)
+    entries = (_vertices(inspection, triangles), 3 * triangles, triangles)
     at = 8 + 16 * count
     for record in records:
         end = _values(inspection, section, record, at, entries[record.domain], materials)
@@ -68,6 +67,14 @@ def inspect_attributes(inspection: Inspection, section: Section, materials: int 
     if at != len(data):
         inspection.found("RDM522", "ATTR", section.at(at))
     return _needs(inspection, records, materials)
+
+
+def _vertices(inspection: Inspection, triangles: int) -> int:
+    """How many vertices the blocks, or the plain triangles, have."""
+    if "TRIS" in inspection.sections:
+        return len(inspection.sections["TRIS"].data) // 12 - triangles
+    headers = np.frombuffer(inspection.sections["BLKH"].data, np.uint8).reshape(-1, 32)
+    return int(headers[:, 9].astype(np.int64).sum()) + len(headers)
 
 
 def inspect_materials(inspection: Inspection, section: Section, rows: object) -> int | None:

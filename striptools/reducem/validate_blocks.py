@@ -11,7 +11,15 @@ import numpy as np
 
 from striptools.reducem.inspection import Inspection, Section
 
-__all__ = ["Blocks", "Geometry", "inspect_blocks", "inspect_headers"]
+__all__ = [
+    "Blocks",
+    "Geometry",
+    "grid_of",
+    "inspect_blocks",
+    "inspect_bounds",
+    "inspect_headers",
+    "off_grid",
+]
 
 _AT_ONCE = 1 << 15
 """Triangles to decode at once."""
@@ -36,6 +44,7 @@ class Geometry:
         turns: (n,) bool, the turn bit of each triangle.
         low: (n, 3) float32, the least coordinates of each triangle.
         high: (n, 3) float32, the largest.
+        corners: (n, 3, 3) float32, where there is HIER; else none.
     """
 
     starts: np.ndarray
@@ -43,6 +52,7 @@ class Geometry:
     turns: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    corners: np.ndarray
 
 
 @dataclass
@@ -92,13 +102,14 @@ def inspect_blocks(inspection: Inspection) -> Geometry | None:
     sound = [part for part in parts if part is not None]
     if not blocks.whole.all() or len(sound) < len(parts):
         return None
-    begins, turns, low, high, lowest, highest = (
+    begins, turns, low, high, corners, lowest, highest = (
         np.concatenate(column) for column in zip(*sound, strict=True)
     )
-    _bounds(inspection, lowest, highest)
+    inspect_bounds(inspection, lowest, highest)
     if not counted:
         return None
-    return Geometry(np.concatenate([[0], np.cumsum(blocks.k)]), begins, turns, low, high)
+    starts = np.concatenate([[0], np.cumsum(blocks.k)])
+    return Geometry(starts, begins, turns, low, high, corners)
 
 
 def inspect_headers(inspection: Inspection, headers: Section, data: Section) -> Blocks:
@@ -195,7 +206,7 @@ def _rows(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Look at some blocks; gives strip begins, turns, triangle bounds, and bounds of all, where sound."""
+    """Look at some blocks: strip begins, turns, triangle bounds, corners, bounds of all, where sound."""
     strips = _strips(inspection, blocks, chunk)
     index = _indices(inspection, blocks, chunk)
     vertices = _vertices(inspection, blocks, chunk)
@@ -213,7 +224,8 @@ def _decode(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> tuple[
     offsets = (np.cumsum(blocks.q[chunk]) - blocks.q[chunk])[row]
     positions = [vertices[corner + offsets] for corner in corners]
     low, high = np.minimum.reduce(positions), np.maximum.reduce(positions)
-    return *strips, low, high, vertices.min(axis=0)[None], vertices.max(axis=0)[None]
+    kept = np.stack(positions, axis=1)[: None if "HIER" in inspection.sections else 0]
+    return *strips, low, high, kept, vertices.min(axis=0)[None], vertices.max(axis=0)[None]
 
 
 def _strips(
@@ -308,13 +320,13 @@ def _vertices(inspection: Inspection, blocks: Blocks, chunk: np.ndarray) -> np.n
     _, row, j = _rows(blocks.q[chunk])
     widths = blocks.widths[chunk]
     at = (blocks.base + (2 + blocks.f) * blocks.k + blocks.c * blocks.w)[chunk][row] + j * widths.sum(1)[row]
-    grid = _grid(inspection)
+    grid = grid_of(inspection)
     columns, sound = [], True
     for axis in range(3):
         width = widths[row, axis]
         u = _bits(blocks.words, at, width)
         value, wrong = _coordinates(blocks, chunk[row], axis, u, width)
-        for code, flaw in (("RDM615", wrong), ("RDM204", ~wrong & _off_grid(value, grid))):
+        for code, flaw in (("RDM615", wrong), ("RDM204", ~wrong & off_grid(value, grid))):
             inspection.found_where(
                 code,
                 flaw,
@@ -344,13 +356,13 @@ def _coordinates(
     return np.where(wrong, np.float32(0.0), value), wrong
 
 
-def _grid(inspection: Inspection) -> int | None:
+def grid_of(inspection: Inspection) -> int | None:
     """The exponent of the scene's grid, where it has one."""
     record = inspection.sections["SCEN"].data
     return int.from_bytes(record[26:28], "little", signed=True) if record[24] & 2 else None
 
 
-def _off_grid(value: np.ndarray, grid: int | None) -> np.ndarray:
+def off_grid(value: np.ndarray, grid: int | None) -> np.ndarray:
     """Where a coordinate is no multiple of 2^grid; exact, for a float64 holds every quotient."""
     if grid is None or not -149 <= grid <= 104:
         return np.zeros(len(value), np.bool_)
@@ -358,7 +370,7 @@ def _off_grid(value: np.ndarray, grid: int | None) -> np.ndarray:
     return np.floor(cells) != cells
 
 
-def _bounds(inspection: Inspection, lowest: np.ndarray, highest: np.ndarray) -> None:
+def inspect_bounds(inspection: Inspection, lowest: np.ndarray, highest: np.ndarray) -> None:
     """Look whether low and high of the scene record are the bounds of all vertices, -0.0 written as 0.0."""
     section = inspection.sections["SCEN"]
     # Adding 0.0 turns -0.0 into 0.0.

@@ -12,7 +12,7 @@ from striptools.reducem.inspection import Inspection, Section
 from striptools.reducem.validate_blocks import Geometry
 from striptools.reducem.validate_instances import Parts
 
-__all__ = ["inspect_nodes"]
+__all__ = ["gathered", "inspect_nodes"]
 
 _NODE = np.dtype(
     {
@@ -298,14 +298,14 @@ def _content(
         low[node, slot], high[node, slot] = _ranges(geometry, ends)
     node, slot = np.nonzero(nodes.is_inner)
     child = nodes.child[node, slot]
-    low[node, slot] = _gathered(np.minimum, low.min(axis=1), parents)[child]
-    high[node, slot] = _gathered(np.maximum, high.max(axis=1), parents)[child]
+    low[node, slot] = gathered(np.minimum, low.min(axis=1), parents)[child]
+    high[node, slot] = gathered(np.maximum, high.max(axis=1), parents)[child]
     empty = ~(nodes.is_inner | nodes.is_leaf)
     low[empty] = high[empty] = 0.0
     return low, high
 
 
-def _gathered(least: np.ufunc, own: np.ndarray, parents: np.ndarray) -> np.ndarray:
+def gathered(least: np.ufunc, own: np.ndarray, parents: np.ndarray) -> np.ndarray:
     """The least of each node and all nodes below it, (m, 3), whatever the depth.
 
     Each round takes what is below from twice as far; that some is taken twice does not matter to a least.

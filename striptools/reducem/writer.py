@@ -20,7 +20,9 @@ from striptools.reducem.attributes import encode_columns, encode_materials, sect
 from striptools.reducem.check import check_scene
 from striptools.reducem.geometries import encode_geometries, encode_instances
 from striptools.reducem.issues import unreadable
+from striptools.reducem.plain_triangles import encode_triangles
 from striptools.reducem.scene import Remap, Scene
+from striptools.reducem.stored_hierarchy import encode_hierarchy, hierarchy_length
 
 __all__ = ["part_sizes", "write_scene"]
 
@@ -71,8 +73,7 @@ def write_scene(scene: Scene, target: str | Path | IO[bytes], *, archive: bool =
 
 def part_sizes(scene: Scene) -> dict[str, int]:
     """Count the bytes of a scene's file by part, uncompressed, without writing it."""
-    totals, packed = scene.blocks.totals(), scene.packed
-    lengths = _lengths(scene)
+    totals, packed, lengths = scene.blocks.totals(), scene.packed, _lengths(scene)
     parts: dict[str, int] = dict.fromkeys(layout.PARTS, 0)
     parts["positions"] = -(-totals["position_bits"] // 8)
     parts["connectivity"] = totals["connectivity_bits"] // 8
@@ -82,6 +83,8 @@ def part_sizes(scene: Scene) -> dict[str, int]:
     parts["remap"] = lengths[layout.REMAP.kind]
     parts["attributes"] = lengths[layout.ATTRIBUTES.kind] + lengths[layout.MATERIALS.kind]
     parts["instances"] = lengths[layout.GEOMETRIES.kind] + lengths[layout.INSTANCES.kind]
+    parts["triangles"] = lengths[layout.TRIANGLES.kind]
+    parts["hierarchy"] = lengths[layout.HIERARCHY.kind]
     present = [length for length in lengths.values() if length]
     total = _table_end(len(present)) + sum(map(layout.aligned, present))
     parts["container"] = total - sum(parts.values())
@@ -105,6 +108,8 @@ def _lengths(scene: Scene) -> dict[bytes, int]:
     for section, items in ((layout.GEOMETRIES, scene.geometries), (layout.INSTANCES, scene.instances)):
         record = layout.GEOMETRY if section is layout.GEOMETRIES else layout.INSTANCE
         lengths[section.kind] = 0 if items is None else record.size * len(items)
+    lengths[layout.HIERARCHY.kind] = hierarchy_length(scene.hierarchy)
+    lengths[layout.TRIANGLES.kind] = 0 if scene.triangles is None else scene.triangles.nbytes
     if scene.remap is None:
         lengths[layout.REMAP.kind] = 0
     return lengths
@@ -136,6 +141,8 @@ def _payloads(scene: Scene) -> list[tuple[layout.Section, Payload]]:
         (layout.METADATA, _metadata(scene.metadata)),
         (layout.GEOMETRIES, encode_geometries(scene.geometries)),
         (layout.INSTANCES, encode_instances(scene.instances)),
+        (layout.HIERARCHY, encode_hierarchy(scene.hierarchy)),
+        (layout.TRIANGLES, encode_triangles(scene.triangles)),
     ]
 
 

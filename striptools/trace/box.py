@@ -77,8 +77,13 @@ def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:
 
 def passes(low: list[Array], high: list[Array], nearest: Array) -> Array:
     """Whether a ray is inside on all axes at once: distances of low and of high sides, by axis."""
+    return entries_of(low, high, nearest)[1]
+
+
+def entries_of(low: list[Array], high: list[Array], nearest: Array) -> tuple[Array, Array]:
+    """Where a ray enters, and whether it `passes`: distances of low and of high sides, by axis."""
     entries = [smaller(a, b) for a, b in zip(low, high, strict=True)]
     exits = [larger(a, b) for a, b in zip(low, high, strict=True)]
     entry = larger(larger(entries[0], entries[1]), larger(entries[2], jnp.float32(0)))
     leaving = smaller(exits[0], smaller(exits[1], exits[2])) * FAR_FACTOR
-    return entry <= smaller(nearest, leaving)
+    return entry, entry <= smaller(nearest, leaving)

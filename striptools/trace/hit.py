@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from striptools.trace.counters import Counters
+
 
 @dataclass(frozen=True, eq=False)
 class Hits:
@@ -19,7 +21,7 @@ class Hits:
             a remap: in the file). The point is (1-u-v) p0 + u p1 + v p2. 0 on a miss.
         v: (r,) float32, the weight of the third corner. 0 on a miss.
         triangle: (r,) int32, the triangle in the file's order; -1 on a miss.
-        steps: (r,) int32, nodes and leaves visited; None unless asked for.
+        counters: (r,) int32 each, what the walk visited, tested and read; None unless asked for.
     """
 
     t: Float32[np.ndarray, " r"]
@@ -27,7 +29,7 @@ class Hits:
     u: Float32[np.ndarray, " r"]
     v: Float32[np.ndarray, " r"]
     triangle: Int32[np.ndarray, " r"]
-    steps: Int32[np.ndarray, " r"] | None = None
+    counters: Counters | None = None
 
     @property
     def hit(self) -> np.ndarray:

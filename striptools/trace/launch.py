@@ -13,7 +13,7 @@ from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import quiet_jax
 from striptools.trace.layout import Layout
 from striptools.trace.leaves import Rays, aligned_full
-from striptools.trace.walk import WalkOptions, WalkScene, trace_rays, walk_rays
+from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
 
 TILES = (2**8, 2**12, 2**16)
 """Rays a CPU device takes at once: few sizes, since each is compiled. A place not filled costs next to
@@ -49,7 +49,7 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
 
     Rays are (origins, directions, t_max) where all are walked at once, else ready ones.
     """
-    walk, arrays = (trace_rays, 3) if options.batch else (walk_rays, 1)
+    walk, arrays = (trace_rays, 3) if options.batch else (_walk_ready, 1)
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
@@ -58,6 +58,10 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
         check_vma=False,
     )
     return jax.jit(split)
+
+
+def _walk_ready(scene: WalkScene, ready: jax.Array, options: WalkOptions) -> Traced:
+    return scene.walk_rays(ready, options)
 
 
 def stream(

@@ -4,6 +4,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from striptools.trace.counters import Counters
 from striptools.trace.leaves import Found, Rays
 from striptools.trace.walk import Decode
 
@@ -29,6 +30,11 @@ class Layout(Protocol):
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
         """(>= 6, 8) float32 boxes of the root's children, NaN where is none, and (8,) int32 children."""
+        ...
+
+    @property
+    def missed(self) -> Counters:
+        """What a ray that meets none of the root's children counts."""
         ...
 
     @property

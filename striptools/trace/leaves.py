@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Int32
@@ -14,6 +14,7 @@ from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
 from striptools.partition.object_split import split_objects
 from striptools.trace.box import MARGIN
+from striptools.trace.counters import Counters
 from striptools.trace.walk import DONE, NO_NAME, Frame
 from striptools.trace.walk_wide import WideScene
 
@@ -31,22 +32,60 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """What a tracer keeps of an expanded scene.
+class LeafBlocks:
+    """Triangles as the tests read them.
 
     Attributes:
-        arrays: For the device, as NumPy arrays.
-        place: (f,) int32, of each face: (leaf * 8 + lane) * 4 + turn, see `kernels.wide.fill_leaf_blocks`.
+        blocks: (l, 10, 8) float32, see `kernels.wide.fill_leaf_blocks`; sizes are padded.
+        place: (f,) int32, of each face: (block * 8 + lane) * 4 + turn; one of them where it has several.
         triangle_of: (f,) int32, the triangle in file order of each face that hits report; -1 for faces not
             in the scene.
-        depth: The most wide nodes on a way from the root down.
+        scale: float32 power of two that positions were multiplied by.
     """
 
-    arrays: WideScene
+    blocks: np.ndarray
     place: Int32[np.ndarray, " f"]
     triangle_of: Int32[np.ndarray, " f"]
+    scale: np.float32
+
+    def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
+        given = (at, traced[0], traced[1], self.place, self.blocks, self.scale, self.triangle_of)
+        weigh_hits(rays[0], rays[1], *given, *found)
+
+
+@dataclass(frozen=True, eq=False)
+class ExpandedLayout:
+    """What a tracer keeps of an expanded scene, whatever its hierarchy.
+
+    Attributes:
+        arrays: For the device, as NumPy arrays; a `walk.WalkScene`.
+        leaves: The blocks among them, and the way from a face to its place.
+        depth: The most nodes on a way from the root down.
+    """
+
+    arrays: Any
+    leaves: LeafBlocks
     depth: int
-    decode: None = None
+
+    @property
+    def decode(self) -> None:
+        """Nothing is packed."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        kept = _arrays_in(self.arrays)
+        return sum(a.nbytes for a in kept) + self.leaves.place.nbytes + self.leaves.triangle_of.nbytes
+
+    def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
+        self.leaves.weigh(rays, at, traced, found)
+
+
+@dataclass(frozen=True, eq=False)
+class WideLayout(ExpandedLayout):
+    """What a tracer keeps of an expanded scene under eight-wide nodes."""
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
@@ -55,25 +94,27 @@ class Layout:
         return node, node[6].view(np.int32)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays."""
-        arrays = (self.arrays.nodes, self.arrays.blocks, self.place, self.triangle_of)
-        return sum(a.nbytes for a in arrays)
-
-    def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
-        """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
-        arrays = self.arrays
-        given = (at, traced[0], traced[1], self.place, arrays.blocks, arrays.frame.scale, self.triangle_of)
-        weigh_hits(rays[0], rays[1], *given, *found)
+    def missed(self) -> Counters:
+        """What a ray that meets none of the root's children counts."""
+        return self.arrays.counters_of(1, 0, 0)
 
 
-def lay_out(scene: "Scene", threads: int = 1) -> Layout:
+def _arrays_in(arrays: Any) -> list[np.ndarray]:
+    """The arrays of named tuples within each other, but those of a frame."""
+    if isinstance(arrays, Frame):
+        return []
+    if isinstance(arrays, tuple):
+        return [array for part in arrays for array in _arrays_in(part)]
+    return [arrays] if isinstance(arrays, np.ndarray) else []
+
+
+def lay_out(scene: "Scene", threads: int = 1) -> WideLayout:
     """Lay a scene out for the walk through its own hierarchy."""
     boxes = scene.triangle_boxes(threads)
     return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
-def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
+def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> WideLayout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
     boxes = scene.triangle_boxes(threads)
     split = split_objects(boxes, threads=threads)
@@ -83,7 +124,7 @@ def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> Layout:
 
 def lay_out_wide(
     scene: "Scene | Placed", wide: WideTree, order: Int32[np.ndarray, " n"] | None = None
-) -> Layout:
+) -> WideLayout:
     """Lay a scene out for the walk through any wide hierarchy over its triangles.
 
     Args:
@@ -91,34 +132,41 @@ def lay_out_wide(
         wide: Its leaves are runs of places.
         order: (n,) int32, the triangle in file order at each place; None where they are in file order.
     """
+    held = fill_blocks(scene, wide.leaf_first, wide.leaf_count, order)
+    nodes = _nodes(wide, held.scale)
+    zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
+    frame = Frame(held.scale, reach_of(scene, held.scale), zero, one, MARGIN)
+    return WideLayout(WideScene(nodes, held.blocks, frame), held, wide.depth)
+
+
+def fill_blocks(
+    scene: "Scene | Placed",
+    first: Int32[np.ndarray, " l"],
+    count: Int32[np.ndarray, " l"],
+    order: Int32[np.ndarray, " k"] | None = None,
+) -> LeafBlocks:
+    """Lay triangles out in blocks of up to eight.
+
+    Args:
+        scene: Whose triangles they are.
+        first: (l,) int32, the first place of each block.
+        count: (l,) int32, how many it holds, 1 to 8.
+        order: (k,) int32, the triangle in file order at each place; None where they are in file order.
+    """
     faces = scene.faces()
     ids, rotations = _names(scene, len(faces))
     triangle = np.arange(len(faces), dtype=np.int32) if order is None else order
     faces, ids, rotations = faces[triangle], ids[triangle], rotations[triangle]
     scale = scale_of(scene)
-    leaves = len(wide.leaf_first)
-    blocks = aligned_full((size_class(leaves), 10, WIDTH), np.nan)
+    blocks = aligned_full((size_class(len(first)), 10, WIDTH), np.nan)
     blocks[:, 9] = NO_NAME.view(np.float32)
     face_count = int(ids.max()) + 1
     place = np.zeros(face_count, np.int32)
-    fill_leaf_blocks(
-        scene.positions,
-        faces,
-        ids,
-        rotations,
-        scale,
-        wide.leaf_first,
-        wide.leaf_count,
-        blocks,
-        blocks.view(np.int32),
-        place,
-    )
+    given = (scene.positions, faces, ids, rotations, scale, first, count)
+    fill_leaf_blocks(*given, blocks, blocks.view(np.int32), place)
     triangle_of = np.full(face_count, -1, np.int32)
     triangle_of[ids] = triangle
-    nodes = _nodes(wide, scale)
-    zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
-    frame = Frame(scale, reach_of(scene, scale), zero, one, MARGIN)
-    return Layout(WideScene(nodes, blocks, frame), place, triangle_of, wide.depth)
+    return LeafBlocks(blocks, place, triangle_of, scale)
 
 
 def _names(scene: "Scene | Placed", count: int) -> tuple[Int32[np.ndarray, " n"], np.ndarray]:

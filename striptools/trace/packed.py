@@ -8,6 +8,7 @@ import numpy as np
 
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
+from striptools.trace.counters import Counters
 from striptools.trace.leaves import Found, Rays, aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
 from striptools.trace.walk_packed import MARGIN, PackedScene
@@ -55,6 +56,11 @@ class PackedLayout:
         if top:
             child = np.where(leaf, top + (word[1] & 0xFFFFFF) + rank, child)
         return np.where(empty, np.float32(np.nan), boxes), child.astype(np.int32)
+
+    @property
+    def missed(self) -> Counters:
+        """What a ray that meets none of the root's children counts."""
+        return self.arrays.counters_of(1, 0, 0)
 
     @property
     def nbytes(self) -> int:

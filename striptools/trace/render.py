@@ -74,7 +74,7 @@ DEFAULT_OPTIONS = RenderOptions()
 class TracesSteps(Protocol):
     """What render needs of a tracer."""
 
-    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, steps: bool = False) -> Hits:
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, counters: bool = False) -> Hits:
         """The closest hits of rays; see `striptools.trace.Tracer`."""
         ...
 
@@ -101,7 +101,7 @@ def render(
         raise LimitError(f"a picture of {count} samples", remedy=f"at most {MOST_SAMPLES} are drawn")
     placed = scene.placed()
     origins, directions = camera_rays(camera, options.samples)
-    hits = tracer.closest_hit(origins, directions, steps=options.shading == "steps")
+    hits = tracer.closest_hit(origins, directions, counters=options.shading == "steps")
     if options.shading == "steps":
         colours = _steps_colours(hits)
     else:
@@ -186,7 +186,7 @@ def _strip_colours(strip: np.ndarray) -> np.ndarray:
 
 def _steps_colours(hits: Hits) -> np.ndarray:
     """(samples, 3) linear colours: the hottest is what one ray in a thousand takes."""
-    steps = np.zeros(len(hits.t)) if hits.steps is None else hits.steps.astype(np.float64)
+    steps = np.zeros(len(hits.t)) if hits.counters is None else hits.counters.steps.astype(np.float64)
     most = max(1.0, float(np.quantile(steps, 0.999))) if len(steps) else 1.0
     return _ramp(COLD_TO_HOT, np.minimum(steps / most, 1.0))
 

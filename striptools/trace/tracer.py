@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from striptools.errors import StriptoolsError, UsageError
+from striptools.trace.alternatives import lay_out_alternative
+from striptools.trace.counters import KINDS, counters_of
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.hit import Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
@@ -76,12 +78,12 @@ class Tracer:
         memory_budget: int | None = None,
     ) -> None:
         _check_kinds(hierarchy, resident)
-        devices = trace_devices(device, threads)
+        devices = self._choose(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
-        self._on_gpu = devices[0].platform != "cpu"
-        self._mesh = device_mesh(devices)
         if scene.instances is not None:
             resident, hierarchy = _of_instances(resident), "rebuilt"
+        if scene.hierarchy is not None:
+            resident = _of_alternative(resident)
         if resident == "auto":
             budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
             fits = hierarchy == "rebuilt" or EXPANDED_BYTES * scene.triangle_count <= budget
@@ -91,7 +93,28 @@ class Tracer:
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
 
+    @classmethod
+    def of_layout(
+        cls, layout: Layout, *, device: DeviceKind = "auto", threads: int | None = None
+    ) -> "Tracer":
+        """A tracer of what is laid out already, expanded: for studies of hierarchies that no scene holds."""
+        tracer = cls.__new__(cls)
+        tracer._choose(device, threads)
+        tracer._origin = np.zeros(3)
+        tracer._resident, tracer._empty = "expanded", False
+        tracer._take(layout)
+        return tracer
+
+    def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
+        """Take the devices to trace on."""
+        devices = trace_devices(device, threads)
+        self._on_gpu = devices[0].platform != "cpu"
+        self._mesh = device_mesh(devices)
+        return devices
+
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
+        if scene.hierarchy is not None and hierarchy == "stored":
+            return lay_out_alternative(scene, scene.hierarchy, threads)
         if self._resident == "compressed":
             return lay_out_packed(scene, threads)
         if hierarchy == "stored":
@@ -133,7 +156,7 @@ class Tracer:
         directions: np.ndarray,
         *,
         t_max: np.ndarray | float | None = None,
-        steps: bool = False,
+        counters: bool = False,
     ) -> Hits:
         """Find what each ray hits first.
 
@@ -141,7 +164,7 @@ class Tracer:
             origins: (r, 3) in the model's unit.
             directions: (r, 3).
             t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
-            steps: Count the nodes and leaves that each ray visits (a program of its own, somewhat slower).
+            counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
 
         Raises:
             UsageError: The arrays are not of these shapes, or not numbers.
@@ -152,25 +175,25 @@ class Tracer:
         t, u, v = np.full(count, np.inf, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
         face, triangle = np.full(count, MISS), np.full(count, MISS)
         dropped = np.zeros(count, np.uint8)
-        counted = np.zeros(count if steps else 0, np.int32)
+        counted = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
-        for at, traced in self._stream(rays, dropped, any_hit=False, steps=steps):
-            if steps:
+        for at, traced in self._stream(rays, dropped, any_hit=False, count=counters):
+            if counters:
                 counted[at] = traced[2]
             _check_ended(traced[1])
             # On this side, while the devices are at the next rays.
             self._layout.weigh(rays, at, traced, found)
-        if steps:
-            counted[dropped == 1] = 1
-        return Hits(t, face, u, v, triangle, counted if steps else None)
+        if counters:
+            counted[dropped == 1] = self._layout.missed if not self._empty else 0
+        return Hits(t, face, u, v, triangle, counters_of(counted) if counters else None)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, steps: bool
+        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, count: bool
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
         if self._empty:
             return
-        options = self._options(any_hit=any_hit, steps=steps)
+        options = self._options(any_hit=any_hit, count=count)
         if not options.batch:
             yield from stream_ready(self._scene, self._layout, rays, dropped, self._mesh, options)
             return
@@ -184,15 +207,15 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, any_hit=True, steps=False):
+        for at, traced in self._stream(rays, dropped, any_hit=True, count=False):
             _check_ended(traced[1])
             hit[at] = traced[1] >= 0
         return hit
 
-    def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:
+    def _options(self, *, any_hit: bool, count: bool) -> WalkOptions:
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode)
+        return WalkOptions(side_by_side, any_hit, count, self._stack_size, self._on_gpu, decode)
 
 
 def _check_kinds(hierarchy: str, resident: str) -> None:
@@ -204,6 +227,17 @@ def _check_kinds(hierarchy: str, resident: str) -> None:
         raise UsageError(
             "a rebuilt hierarchy is expanded", where="resident", remedy="use the stored hierarchy"
         )
+
+
+def _of_alternative(resident: ResidentKind) -> ResidentKind:
+    """How a scene with a hierarchy of its own is kept."""
+    if resident == "compressed":
+        raise UsageError(
+            "only the default hierarchy is traced compressed",
+            where="resident",
+            remedy="use expanded, or convert it with --hierarchy reducem",
+        )
+    return "expanded"
 
 
 def _of_instances(resident: ResidentKind) -> ResidentKind:

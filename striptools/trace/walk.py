@@ -30,8 +30,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import Int32
 
 from striptools.trace.box import Slab, slab_of
+from striptools.trace.counters import Counters
 from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
 from striptools.trace.triangle import Shear, shear_of
 
@@ -48,6 +50,9 @@ STUCK = np.int32(-2)
 
 NO_NAME = np.int32(2**31 - 1)
 SLACK = np.float32(1 + 2**-20)
+
+_A_NODE, _A_LEAF, _A_TRIANGLE = np.eye(3, dtype=np.int32)
+"""Nodes, leaves and triangles that a visit counts as."""
 
 
 class Frame(NamedTuple):
@@ -113,6 +118,18 @@ class WalkScene(Protocol):
         """Test the triangles of a leaf, each lane against its own closest hit."""
         ...
 
+    def triangles_of(self, child: Array) -> Array:
+        """() int32: how many triangles a leaf has; anything where the child is none."""
+        ...
+
+    def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
+        """What visits of so many nodes, leaves and triangles come to."""
+        ...
+
+    def walk_rays(self, ready: Array, options: "WalkOptions") -> "Traced":
+        """Walk r rays made ready: `walk_rays` of this module."""
+        ...
+
 
 class WalkOptions(NamedTuple):
     """What is compiled in.
@@ -120,7 +137,7 @@ class WalkOptions(NamedTuple):
     Attributes:
         interleave: Rays that go side by side.
         any_hit: End at the first hit.
-        count_steps: Count nodes and leaves visited.
+        counting: Count visits, tests and bytes: what `Counters` has.
         stack_size: Entries of the stack: the depth of the tree and two more.
         batch: Walk all rays at once by vmap (GPU), not one group after the other (CPU).
         decode: How leaves are decoded, where they are packed.
@@ -128,7 +145,7 @@ class WalkOptions(NamedTuple):
 
     interleave: int
     any_hit: bool
-    count_steps: bool
+    counting: bool
     stack_size: int
     batch: bool = False
     decode: "Decode | None" = None
@@ -153,14 +170,20 @@ class Decode(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """One entry a ray; what was not asked for has none. `name` is what the scene calls the triangle hit."""
+    """One entry a ray; what was not asked for has none.
+
+    Attributes:
+        t: (r,) float32; (0,) of any hit.
+        name: (r,) int32, what the scene calls the triangle hit.
+        counters: (r, 6) int32, in the order of `Counters`; (r, 0) where nothing is counted.
+    """
 
     t: Array
     name: Array
-    steps: Array
+    counters: Array
 
 
-class _Ray(NamedTuple):
+class ReadyRay(NamedTuple):
     """What stays the same all along a walk, in as few arrays as can be: a loop pays for each.
 
     Attributes:
@@ -176,16 +199,19 @@ class _Ray(NamedTuple):
 
     @property
     def slab(self) -> Slab:
+        """The ray as the box tests see it."""
         return Slab(self.floats[0:3], self.floats[3:6], self.floats[6:9])
 
     @property
     def shear(self) -> Shear:
+        """The ray as the triangle test sees it."""
         x, y, z = (index(self.ints[k]) for k in range(3))
         origin = (self.floats[9], self.floats[10], self.floats[11])
         return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14])
 
     @property
     def t_max(self) -> Array:
+        """Only hits nearer than this count, in t of the walk."""
         return self.floats[15]
 
     @property
@@ -199,8 +225,9 @@ class _Ray(NamedTuple):
         return self.ints[3]
 
     @property
-    def start(self) -> "_Place":
-        return _Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
+    def start(self) -> "Place":
+        """Where the walk starts."""
+        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
 
     @property
     def visited(self) -> Array:
@@ -208,7 +235,7 @@ class _Ray(NamedTuple):
         return self.ints[6]
 
 
-class _Place(NamedTuple):
+class Place(NamedTuple):
     """Where a ray is: the child to visit next, and the lanes left of the node it came from."""
 
     child: Array
@@ -229,11 +256,11 @@ def trace_rays(
         t_max: (r,) float32.
         options: What to compile in.
     """
-    return walk_rays(scene, prepared_rays(scene, origins, directions, t_max), options)
+    return scene.walk_rays(prepared_rays(scene, origins, directions, t_max), options)
 
 
 def prepared_rays(scene: WalkScene, origins: Array, directions: Array, t_max: Array) -> Array:
-    """Ready rays for the walk: (r, 24) float32, the floats and the bits of the ints of `_Ray`."""
+    """Ready rays for the walk: (r, 24) float32, the floats and the bits of the ints of `ReadyRay`."""
     floats, ints = jax.vmap(lambda *ray: _prepare(scene, *ray))(origins, directions, t_max)
     return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)], axis=1)
 
@@ -261,14 +288,21 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     else:
         # One group's stacks serve the next: only their bottom is read before it is written.
         walked = lax.scan(walk, stacks, rows)[1]
-    t, name, steps = (a.reshape(-1) for a in walked)
+    t, name = walked.t.reshape(-1), walked.name.reshape(-1)
+    counters = walked.counters.reshape(len(ready), -1)
     if options.any_hit:
         t = jnp.zeros(0)
-    return Traced(t, name, steps)
+    return Traced(t, name, counters)
+
+
+def ready_ray(row: Array) -> ReadyRay:
+    """The ray that a row says."""
+    ints = lax.bitcast_convert_type(row[FLOATS:], jnp.int32)
+    return ReadyRay(row[:FLOATS], ints, jnp.int32(1) << (jnp.arange(WIDTH, dtype=jnp.int32) ^ ints[3]))
 
 
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
-    """Floats and ints of a `_Ray`.
+    """Floats and ints of a `ReadyRay`.
 
     A ray is scaled by powers of two: neither the model's unit nor the direction's length matters after that.
     """
@@ -299,8 +333,8 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
 
 
 def _next_child(
-    scene: WalkScene, ray: _Ray, node: Array, lanes: Array, height: Array, stack: Array
-) -> _Place:
+    scene: WalkScene, ray: ReadyRay, node: Array, lanes: Array, height: Array, stack: Array
+) -> Place:
     """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
     empty = lanes == 0
     height = jnp.where(empty, height - 1, height)
@@ -309,12 +343,12 @@ def _next_child(
     lanes = jnp.where(empty, top[1], lanes)
     order = 31 - lax.clz(lanes)
     child = scene.child_of(node, index(order ^ ray.mirror))
-    return _Place(child, node, lanes ^ (jnp.int32(1) << order), height)
+    return Place(child, node, lanes ^ (jnp.int32(1) << order), height)
 
 
 def _visit_node(
-    scene: WalkScene, ray: _Ray, place: _Place, limit: Array, stack: Array
-) -> tuple[_Place, Array]:
+    scene: WalkScene, ray: ReadyRay, place: Place, limit: Array, stack: Array
+) -> tuple[Place, Array]:
     """Put what is left of the last node on the stack, test this one's boxes, and choose the next child."""
     entry = jnp.stack([place.node, place.lanes])[None]
     stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
@@ -324,7 +358,7 @@ def _visit_node(
     there = _next_child(scene, ray, place.child, lanes, height, stack)
     # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
     active = place.child >= 0
-    return _Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
+    return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
 def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
@@ -333,12 +367,18 @@ def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
     return Best(folded(t, smaller), t, jnp.where(closer, name, best.name))
 
 
-def _closest_name(scene: WalkScene, best: Best, any_hit: bool) -> Array:
-    """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none."""
+def closest_name(best: Best, any_hit: bool, scene: WalkScene | None = None) -> Array:
+    """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
+
+    Args:
+        best: In each lane.
+        any_hit: Any of them will do.
+        scene: Where names are not faces.
+    """
     held = (best.t == best.nearest) & (best.name >= 0)
     names = jnp.where(held, best.name, NO_NAME)
     least = folded(names, smaller)
-    if scene.has_faces and not any_hit:
+    if scene is not None and scene.has_faces and not any_hit:
         several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
         least = lax.cond(several, lambda: _name_of_least(scene, names), lambda: least)
     return jnp.where(least == NO_NAME, MISS, least)
@@ -354,16 +394,16 @@ class _Walked(NamedTuple):
 
     t: Array
     name: Array
-    steps: Array
+    counters: Array
 
 
 class _State(NamedTuple):
-    """Where the rays of a group are: what an inner loop carries. It counts its turns, and steps of a ray."""
+    """Where the rays of a group are: what an inner loop carries. It counts its turns, and of a ray visits."""
 
-    places: tuple[_Place, ...]
+    places: tuple[Place, ...]
     stacks: tuple[Array, ...]
     turns: Array
-    steps: tuple[Array, ...]
+    visits: tuple[Array, ...]
 
 
 @dataclass(frozen=True)
@@ -371,10 +411,10 @@ class _Walk:
     """The steps of the walk of one group of rays."""
 
     scene: WalkScene
-    rays: tuple[_Ray, ...]
+    rays: tuple[ReadyRay, ...]
     options: WalkOptions
 
-    def goes_on(self, state: _State, at: Callable[[_Place], Array]) -> Array:
+    def goes_on(self, state: _State, at: Callable[[Place], Array]) -> Array:
         """Whether any ray is `at` a place, and the walk within its bound: each ray at each node once."""
         found = jnp.bool_(False)
         for place in state.places:
@@ -391,7 +431,7 @@ class _Walk:
         ]
         places, stacks = tuple(v[0] for v in visits), tuple(v[1] for v in visits)
         at_node = [place.child >= 0 for place in state.places]
-        return _State(places, stacks, state.turns + 1, self.count(state.steps, at_node))
+        return _State(places, stacks, state.turns + 1, self.count(state.visits, at_node, _A_NODE))
 
     def visit_leaves(self, state: _State, bests: tuple[Best, ...]) -> tuple[_State, tuple[Best, ...]]:
         """Each ray that is at a leaf tests it and goes on."""
@@ -404,10 +444,16 @@ class _Walk:
             )
             for k in range(len(self.rays))
         ]
-        steps = self.count(state.steps, at_leaf)
-        return state._replace(places=tuple(a[0] for a in after), steps=steps), tuple(a[1] for a in after)
+        visits = self.count(state.visits, at_leaf, _A_LEAF)
+        if visits:
+            tested = [
+                jnp.where(there, self.scene.triangles_of(place.child), 0)
+                for there, place in zip(at_leaf, state.places, strict=True)
+            ]
+            visits = tuple(each + _A_TRIANGLE * count for each, count in zip(visits, tested, strict=True))
+        return state._replace(places=tuple(a[0] for a in after), visits=visits), tuple(a[1] for a in after)
 
-    def leave_leaf(self, k: int, state: _State, best: Best) -> tuple[_Place, Best]:
+    def leave_leaf(self, k: int, state: _State, best: Best) -> tuple[Place, Best]:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
         best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
@@ -416,32 +462,31 @@ class _Walk:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
         return there, best
 
-    def stay(self, k: int, state: _State, best: Best) -> tuple[_Place, Best]:
+    def stay(self, k: int, state: _State, best: Best) -> tuple[Place, Best]:
         """Ray k is at no leaf."""
         return state.places[k], best
 
-    def count(self, steps: tuple[Array, ...], there: list[Array]) -> tuple[Array, ...]:
-        """Add a step to each ray that took one, where steps are counted."""
-        return tuple(step + moved for step, moved in zip(steps, there, strict=True)) if steps else ()
+    def count(
+        self, visits: tuple[Array, ...], there: list[Array], one: Int32[np.ndarray, " 3"]
+    ) -> tuple[Array, ...]:
+        """Add a visit to each ray that made one, where visits are counted."""
+        if not visits:
+            return ()
+        return tuple(each + one * moved for each, moved in zip(visits, there, strict=True))
 
 
 def _walk_group(
     scene: WalkScene, group: Array, stacks: tuple[Array, ...], options: WalkOptions
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
-    lanes = jnp.arange(WIDTH, dtype=jnp.int32)
-    floats = [row[:FLOATS] for row in group]
-    words = [lax.bitcast_convert_type(row[FLOATS:], jnp.int32) for row in group]
-    rays = tuple(
-        _Ray(real, ints, jnp.int32(1) << (lanes ^ ints[3])) for real, ints in zip(floats, words, strict=True)
-    )
+    rays = tuple(ready_ray(row) for row in group)
     walk = _Walk(scene, rays, options)
     zero = jnp.int32(0)
     places = tuple(ray.start for ray in rays)
     bests = tuple(
         Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
     )
-    steps = tuple(ray.visited for ray in rays) if options.count_steps else ()
+    visits = tuple(ray.visited * _A_NODE for ray in rays) if options.counting else ()
 
     def nodes_then_leaves(carried: tuple[_State, tuple[Best, ...]]) -> tuple[_State, tuple[Best, ...]]:
         state, bests = carried
@@ -455,16 +500,18 @@ def _walk_group(
     state, bests = lax.while_loop(
         lambda carried: walk.goes_on(carried[0], lambda place: place.child != DONE),
         nodes_then_leaves,
-        (_State(places, stacks, zero, steps), bests),
+        (_State(places, stacks, zero, visits), bests),
     )
     results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
     t, name = (jnp.stack([r[k] for r in results]) for k in range(2))
-    counted = jnp.stack(state.steps) if steps else jnp.zeros((len(rays), 0))
+    counted = jnp.zeros((len(rays), 0), jnp.int32)
+    if visits:
+        counted = jnp.stack([jnp.stack(scene.counters_of(*each)) for each in state.visits])
     return state.stacks, _Walked(t, name, counted)
 
 
-def _result(scene: WalkScene, ray: _Ray, place: _Place, best: Best, any_hit: bool) -> tuple[Array, Array]:
+def _result(scene: WalkScene, ray: ReadyRay, place: Place, best: Best, any_hit: bool) -> tuple[Array, Array]:
     """What is reported of a ray: t in the caller's units, and the name of the triangle."""
-    name = _closest_name(scene, best, any_hit)
+    name = closest_name(best, any_hit, scene)
     t = jnp.where(name < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
     return t, jnp.where(place.child != DONE, STUCK, name)

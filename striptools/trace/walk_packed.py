@@ -35,14 +35,31 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
+from striptools.trace.counters import Counters
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
-from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
+from striptools.trace.walk import (
+    DONE,
+    Best,
+    Decode,
+    Frame,
+    Traced,
+    WalkOptions,
+    replaced,
+    walk_rays,
+)
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
 
 LANES = 8
+
+LEAF_BYTES = 40
+"""What a leaf reads beside its triangles: the run, where the block's runs begin, and the block's header."""
+
+TRIANGLE_BYTES = 3 + 3 * 10
+"""What a triangle reads, about: three indices of a byte and three vertices of 80 bits."""
+
 BLOCK_BITS = 0xFFFFFF
 ALL = np.uint32(0xFFFFFFFF)
 
@@ -130,6 +147,19 @@ class PackedScene(NamedTuple):
         name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
         found = _any((t > 0) & (t <= best.t))
         return lax.cond(found, lambda: self._merged(best, t, name, options.any_hit), lambda: best)
+
+    def triangles_of(self, child: Array) -> Array:
+        """() int32: how many triangles a run has."""
+        return jnp.where(child < 0, (self._run_of(child)[1] >> 8 & 7) + 1, 0).astype(jnp.int32)
+
+    def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
+        """A node is eight boxes and 64 bytes; a leaf a run, a header, indices and vertices: see the notes."""
+        bytes_read = leaves * LEAF_BYTES + triangles * TRIANGLE_BYTES
+        return Counters(nodes, leaves, nodes * 8, triangles, nodes * 64, bytes_read)
+
+    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+        """Walk r rays made ready."""
+        return walk_rays(self, ready, options)
 
     def _merged(self, best: Best, t: Array, name: Array, any_hit: bool) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
@@ -355,15 +385,16 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # 0.59 / 0.48 to 0.58); one gather of rows of words (0.03); the remap read for ties alone, hits merged under a
 # cond of their own (0.07 / 0.08 / 0.1). Nodes alone, over expanded leaves, take 0.80-0.83 / 0.86 / 0.87-0.9.
 #
-# Where the time goes (camera rays from the picture's middle): the expanded walk takes 255 of 348 ns, 54 % of it
-# in the node loop; this one 437 of 564, 39 %. So nodes cost 32 ns more, leaves 150, weights of hits 30. Both
-# loops run at about five instructions a cycle, a third of them XLA's own moves.
+# Where the time goes (camera rays from the picture's middle): the expanded walk takes 255 of 348 ns, 54 % of
+# it in the node loop; this one 437 of 564, 39 %. So nodes cost 32 ns more, leaves 150, weights of hits 30.
+# Both loops run at about five instructions a cycle, a third of them XLA's own moves.
 #
 # Tried and lost: words selected for each coordinate instead of each vertex 1.0; the new closest hits marked
-# by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along 0.92. Ratios of speed to
-# what stands here: ten vertices of a strip decoded once, the far corners gathered from them, 0.92 (2100
-# instructions fewer, but through memory), with a concatenation 0.57; both rays' leaves at once under vmap 0.82,
-# one after the other without a cond 0.85; near and far planes chosen by the direction's signs in the loop 0.92;
-# closest hits by the least integer, any lane by a sum of integers 1.0; one count of bits for nodes and blocks in
-# the place of two 1.0; four words of a record read in the place of sixteen 1.0; hits weighed in two passes of
-# 64 1.0. Three words a vertex in the place of the four that the widest blocks need would give 1.02.
+# by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along 0.92. Ratios of speed
+# to what stands here: ten vertices of a strip decoded once, the far corners gathered from them, 0.92 (2100
+# instructions fewer, but through memory), with a concatenation 0.57; both rays' leaves at once under vmap
+# 0.82, one after the other without a cond 0.85; near and far planes chosen by the direction's signs in the
+# loop 0.92; closest hits by the least integer, any lane by a sum of integers 1.0; one count of bits for nodes
+# and blocks in the place of two 1.0; four words of a record read in the place of sixteen 1.0; hits weighed in
+# two passes of 64 1.0. Three words a vertex in the place of the four that the widest blocks need would give
+# 1.02.

@@ -3,7 +3,7 @@
 It is slow and plain on purpose, needs nothing but the standard library and shares no code with striptools.
 Every refusal is a `RefusedError` that names the clause of SPEC.md. It reads raw sections; where an archive
 (codecs 1 to 3) needs more it says what. It checks what sections 3 to 6 rule, but not whether the boxes
-of nodes hold what is below them: it decodes them, and a validator looks.
+of nodes, their cells and slabs hold what is below them: it decodes them, and a validator looks.
 
     python reader.py FILE          print a summary
     python reader.py --obj FILE    print a Wavefront OBJ of the triangles, in the order of the file
@@ -16,11 +16,12 @@ import sys
 import zlib
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
 MUST_UNDERSTAND = {"SCEN": 1, "BLKH": 1, "BLKD": 1, "NODE": 1, "RUNS": 1}
-MUST_UNDERSTAND |= {"GEOM": 1, "INST": 1, "RMAP": 0, "ATTR": 0, "MATL": 0, "META": 0}
+MUST_UNDERSTAND |= {"GEOM": 1, "INST": 1, "HIER": 1, "TRIS": 1, "RMAP": 0, "ATTR": 0, "MATL": 0, "META": 0}
 MOST_DEEP = 32
 """Levels of arrays and objects in metadata."""
 
@@ -46,12 +47,28 @@ class Node:
 
 
 @dataclass
+class Hierarchy:
+    """What HIER holds.
+
+    `nodes` has the `u32` words of each node, eight or two of them; `items` are the numbers behind; `bounds`
+    are the bit patterns of the root's cell.
+    """
+
+    kind: int
+    over: int
+    flags: int
+    nodes: list
+    items: list
+    bounds: tuple
+
+
+@dataclass
 class Scene:
     """A decoded file.
 
     Attributes:
         record: The fields of SCEN by their names; floats as floats.
-        vertices: The vertices of all blocks in a row, each the three 32-bit patterns of its floats.
+        vertices: The vertices of all blocks, or of TRIS, in a row, each three 32-bit patterns of floats.
         faces: The triangles in the order of the file, each three numbers of `vertices`.
         block_starts: The first triangle of each block, and n.
         begins: For each triangle 1 where a strip begins, else 0.
@@ -67,6 +84,7 @@ class Scene:
             is no GEOM.
         instances: For each `(geometry, first_face, matrix)`, the matrix twelve floats; None where there are
             none.
+        hierarchy: What HIER holds; None where it is not there.
         passed_over: The kinds of sections that this reader does not know.
     """
 
@@ -84,6 +102,7 @@ class Scene:
     metadata: dict = field(default_factory=dict)
     geometries: list = field(default_factory=list)
     instances: list | None = None
+    hierarchy: Hierarchy | None = None
     passed_over: list = field(default_factory=list)
 
 
@@ -99,10 +118,13 @@ def read(data):
     sections, passed_over = read_container(bytes(data))
     if "SCEN" not in sections:
         raise RefusedError("4", "there is no section SCEN")
-    record = read_record(sections["SCEN"], "GEOM" in sections)
+    record = read_record(sections["SCEN"], sections)
     check_lengths(record, sections)
     scene = Scene(record, passed_over=passed_over)
-    read_blocks(scene, sections.get("BLKH", b""), sections.get("BLKD", b""))
+    if "TRIS" in sections:
+        read_triangles(scene, sections["TRIS"])
+    else:
+        read_blocks(scene, sections.get("BLKH", b""), sections.get("BLKD", b""))
     check_bounds(scene)
     scene.geometries = read_geometries(scene, sections.get("GEOM", bytes(12) + struct.pack("<I", 2**32 - 1)))
     if "GEOM" in sections:
@@ -112,8 +134,16 @@ def read(data):
         scene.runs = read_runs(scene, sections["RUNS"])
     scene.nodes = [read_node(scene, i, sections["NODE"]) for i in range(record["node_count"])]
     check_nodes(scene)
+    if "HIER" in sections:
+        scene.hierarchy = read_hierarchy(scene, sections["HIER"])
+    read_beside(scene, sections)
+    return scene
+
+
+def read_beside(scene, sections):
+    """Decode what is not needed to trace."""
     if "RMAP" in sections:
-        scene.remap = read_remap(record, sections["RMAP"])
+        scene.remap = read_remap(scene.record, sections["RMAP"])
         check_owners(scene)
     if "MATL" in sections:
         scene.materials = read_materials(sections["MATL"])
@@ -123,7 +153,6 @@ def read(data):
         raise RefusedError("4", "MATL is there and not needed")
     if "META" in sections:
         scene.metadata = read_metadata(sections["META"])
-    return scene
 
 
 # Section 3: the container
@@ -212,7 +241,7 @@ FIELDS = (
 )
 
 
-def read_record(payload, several):
+def read_record(payload, sections):
     """The fields of SCEN by name, with `stored` and `grid` for the two flags, and `low`, `high`, `cell`."""
     if len(payload) != RECORD.size:
         raise RefusedError("4.1", f"SCEN has {len(payload)} bytes")
@@ -234,18 +263,21 @@ def read_record(payload, several):
         raise RefusedError("4.1", "the grid exponent is out of its range")
     if not all(-149 <= cell <= 127 for cell in record["cell"]):
         raise RefusedError("4.1", "a cell exponent is out of its range")
-    check_counts(record, several)
+    check_counts(record, sections)
     if record["triangle_count"] == 0:
         check_empty(record, payload)
     return record
 
 
-def check_counts(record, several):
-    """Refuse counts that no scene can have; `several` says whether it has GEOM."""
+def check_counts(record, sections):
+    """Refuse counts that no scene of these sections can have."""
+    several, other, plain = ("GEOM" in sections), ("HIER" in sections), ("TRIS" in sections)
     n, b, m = record["triangle_count"], record["block_count"], record["node_count"]
     top, r, longest = record["top_count"], record["run_count"], record["longest_run"]
-    wrong = b > 2**24 or m > 2**28 or (b == 0) != (n == 0) or not b <= n <= 256 * b
-    wrong = wrong or record["source_face_count"] < n or (top > 0 if b < 2 else top == 0 and not several)
+    wrong = b > 2**24 or m > 2**28 or (b == 0) != (n == 0 or plain) or not b <= n
+    wrong = wrong or (n > 256 * b and not plain) or (other and record["stored"])
+    wrong = wrong or record["source_face_count"] < n
+    wrong = wrong or (top > 0 if b < 2 or other else top == 0 and not several)
     if record["stored"]:
         wrong = wrong or m < top + b or not b <= r <= n or not 1 <= longest <= 8
     else:
@@ -276,10 +308,24 @@ def check_lengths(record, sections):
             raise RefusedError("4.1", f"{kind} has another length than the counts give it")
         if kind in sections and not length:
             raise RefusedError("4", f"{kind} is there and not needed")
-    if ("BLKD" in sections) != (n > 0):
+    check_alternatives(n, sections)
+    if ("BLKD" in sections) != (b > 0):
         raise RefusedError("4", "BLKD is missing, or there and not needed")
     if ("GEOM" in sections) != ("INST" in sections) or (n == 0 and "GEOM" in sections):
         raise RefusedError("4", "of GEOM and INST one is missing, or they are there and not needed")
+
+
+def check_alternatives(n, sections):
+    """Refuse sections that are not there together, HIER and TRIS of another length than they may have."""
+    if "HIER" in sections and ("GEOM" in sections or not n):
+        raise RefusedError("4", "HIER is there with GEOM, or in an empty scene")
+    if ("TRIS" in sections) != ("HIER" in sections and sections["HIER"][0] == 4):
+        raise RefusedError("4", "TRIS is missing, or there and not needed")
+    if len(sections.get("HIER", b"")) > 1024 * (n + 1):
+        raise RefusedError("4", "HIER has more bytes than there may be")
+    length = len(sections.get("TRIS", bytes(12 * n + 36)))
+    if length % 12 or not 12 * n + 36 <= length <= max(48 * n, 36):
+        raise RefusedError("4.13", "TRIS has another length than the triangles give it")
 
 
 # Sections 4.2 and 4.3: blocks
@@ -772,6 +818,179 @@ def placed(scene):
     return vertices, faces, numbers
 
 
+# Sections 4.12 and 4.13: a hierarchy of another kind, and plain triangles
+
+
+def read_triangles(scene, payload):
+    """Decode plain triangles into `scene.vertices` and `scene.faces`."""
+    n = scene.record["triangle_count"]
+    rows = list(struct.iter_unpack("<3I", payload))
+    scene.vertices, faces = rows[:-n], rows[-n:]
+    scene.faces = [list(face) for face in faces]
+    scene.begins = [1] * n
+    try:
+        check_indices([i for face in faces for i in face], len(scene.vertices))
+    except RefusedError as refusal:
+        raise RefusedError("4.13", str(refusal)) from None
+    if any(len(set(face)) < 3 for face in faces):
+        raise RefusedError("4.13", "a triangle names one vertex twice")
+    if any(bits >> 23 & 255 == 255 for vertex in scene.vertices for bits in vertex):
+        raise RefusedError("4.13", "a coordinate is not finite")
+
+
+OVER = {1: (0, 1, 2), 2: (0, 1), 3: (0, 1, 2), 4: (0,)}
+"""What the objects of each kind may be."""
+
+
+def read_hierarchy(scene, payload):
+    """The hierarchy of HIER."""
+    if len(payload) < 64:
+        raise RefusedError("4.12", "no whole record")
+    kind, over, flags, reserved, count, items, reserved_2 = struct.unpack_from("<4B3I", payload)
+    if reserved or reserved_2 or flags > 1 or any(payload[40:64]):
+        raise RefusedError("4.12", "a reserved field is not zero")
+    if over not in OVER.get(kind, ()) or (flags and kind in (2, 4)):
+        raise RefusedError("4.12", "no such kind, or over what it cannot be over")
+    bounds = struct.unpack_from("<6I", payload, 16)
+    if any(bits >> 23 & 255 == 255 for bits in bounds) if kind == 2 else any(bounds):
+        raise RefusedError("4.12", "the cell of the root is not finite, or there and not needed")
+    words = 2 if kind == 2 else 8
+    if len(payload) != 64 + 4 * words * count + 4 * items or count > 2**28:
+        raise RefusedError("4.12", "another length than the counts give it")
+    table = struct.unpack_from(f"<{words * count}I", payload, 64)
+    nodes = [table[i : i + words] for i in range(0, len(table), words)]
+    rest = list(struct.unpack_from(f"<{items}I", payload, 64 + 4 * len(table)))
+    found = Hierarchy(kind, over, flags, nodes, rest, bounds)
+    starts = object_starts(scene, over)
+    if kind in (1, 3):
+        wanted = sorted(rest) == list(range(len(starts) - 1)) if flags else not rest
+        if not wanted:
+            raise RefusedError("4.12", "the order does not name every object once")
+    check = {1: check_heap, 2: check_cells, 3: check_places, 4: check_trees}[kind]
+    check(found, len(starts) - 1)
+    return found
+
+
+def object_starts(scene, over):
+    """The first triangle of each object, and n."""
+    n = scene.record["triangle_count"]
+    if over == 0:
+        return list(range(n + 1))
+    return [t for t in range(n) if scene.begins[t]] + [n] if over == 1 else scene.block_starts
+
+
+def check_heap(found, count):
+    """Refuse an SLBVH that does not have each place in one leaf."""
+    nodes, size = found.nodes, len(found.nodes)
+    if size < 2 or size & (size - 1):
+        raise RefusedError("4.12", f"{size} nodes are no heap")
+    waiting, reached = [(1, 0, count)], set()
+    while waiting:
+        number, first, held = waiting.pop()
+        a, b = nodes[number][6:]
+        reached.add(number)
+        if (a >> 3, b) != (held, first) or held == 0:
+            raise RefusedError("4.12", f"node {number} does not hold the places that are left to it")
+        if a & 3 > (0 if a & 4 else 2):
+            raise RefusedError("4.12", f"node {number} has no such axis")
+        if not a & 4:
+            if 2 * number + 1 >= size:
+                raise RefusedError("4.12", f"node {number} has no room for children")
+            left = nodes[2 * number][6] >> 3
+            waiting += [(2 * number, first, left), (2 * number + 1, first + left, held - left)]
+    if any(any(node) for number, node in enumerate(nodes) if number not in reached):
+        raise RefusedError("4.12", "a node that is not reached is not zero")
+
+
+def walk_preorder(nodes, second_of):
+    """For each node its number and the numbers of the nodes above it, while they are where they must be."""
+    if not nodes:
+        raise RefusedError("4.12", "there is no node")
+    waiting, above = [(len(nodes), ())], ()
+    for number, node in enumerate(nodes):
+        if len(above) >= 128 or not waiting:
+            raise RefusedError("4.12", f"node {number} is too deep, or below none")
+        yield number, above
+        second = second_of(node)
+        if second is None:
+            end, above = waiting.pop()
+            if end != number + 1:
+                raise RefusedError("4.12", f"node {number} is followed by another than its parent says")
+        else:
+            above = (*above, number)
+            waiting.append((second, above))
+    if waiting:
+        raise RefusedError("4.12", "a node has no second child")
+
+
+def second_of_boxes(node):
+    """The second child of an inner node with a box, None of a leaf."""
+    return None if node[7] else node[6]
+
+
+def second_of_cells(node):
+    """The second child of an inner node of a kd-tree, None of a leaf."""
+    return None if node[1] & 3 == 3 else node[1] >> 2
+
+
+def check_places(found, count):
+    """Refuse a BVH that does not have each place in one leaf."""
+    numbers = [number for number, _ in walk_preorder(found.nodes, second_of_boxes)]
+    leaves = sorted(found.nodes[number][6:] for number in numbers if found.nodes[number][7])
+    at = 0
+    for first, held in leaves:
+        if first != at:
+            raise RefusedError("4.12", f"place {min(first, at)} is not in one leaf")
+        at += held
+    if at != count:
+        raise RefusedError("4.12", "not all places are in leaves")
+
+
+def check_trees(found, count):
+    """Refuse trees of presorted triangles that are not those of the leaves."""
+    starts = found.items
+    if len(starts) < 2 or (len(starts) > 2 and not found.nodes):
+        raise RefusedError("4.12", "no tree, or several without a node")
+    if starts[0] or starts[-1] != count or any(a >= b for a, b in pairwise(starts)):
+        raise RefusedError("4.12", "the trees do not begin one behind the other")
+    if found.nodes:
+        numbers = [number for number, _ in walk_preorder(found.nodes, second_of_boxes)]
+        leaves = [found.nodes[number][6:] for number in numbers if found.nodes[number][7]]
+        if leaves != [(a, b - a) for a, b in pairwise(starts)]:
+            raise RefusedError("4.12", "the leaves do not have the trees in turn")
+
+
+def check_cells(found, count):
+    """Refuse a kd-tree with planes out of their cells, or leaves that do not have the references in turn."""
+    cells, at = {}, 0
+    for number, above in walk_preorder(found.nodes, second_of_cells):
+        parent = above[-1] if above else None
+        cells[number] = cell_of(found, cells.get(parent), parent, number)
+        a, b = found.nodes[number]
+        axis = b & 3
+        if axis < 3 and not cells[number][axis] <= as_float(a) <= cells[number][axis + 3]:
+            raise RefusedError("4.12", f"node {number}: its plane is not in its cell")
+        if axis == 3:
+            references = found.items[at : at + (b >> 2)]
+            if a != at or len(references) < b >> 2:
+                raise RefusedError("4.12", f"node {number} does not have the references in turn")
+            if any(x >= y for x, y in pairwise(references)):
+                raise RefusedError("4.12", f"node {number}: its references do not rise")
+            at += b >> 2
+    if at != len(found.items) or any(item >= count for item in found.items):
+        raise RefusedError("4.12", "a reference without a leaf, or to no object")
+
+
+def cell_of(found, cell, parent, number):
+    """The six bounds of a node's cell, which is its parent's, cut."""
+    if parent is None:
+        return [as_float(bits) for bits in found.bounds]
+    a, b = found.nodes[parent]
+    cell = list(cell)
+    cell[(b & 3) + (3 if number == parent + 1 else 0)] = as_float(a)
+    return cell
+
+
 # Section 4.9: metadata
 
 
@@ -845,6 +1064,7 @@ def summary(scene):
         "grid": f"2^{record['grid_exponent']}" if record["grid"] else "none",
         "origin": [record[f"origin_{axis}"] for axis in "xyz"] if record["flags"] & 4 else "none",
         "remap": "yes" if scene.remap else "no",
+        "hierarchy": "as section 4.4 has it" if scene.hierarchy is None else f"kind {scene.hierarchy.kind}",
         "geometries": len(scene.geometries),
         "instances": "none" if scene.instances is None else len(scene.instances),
         "attributes": ", ".join(scene.attributes) or "none",

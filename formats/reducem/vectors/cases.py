@@ -5,26 +5,37 @@ import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 
 from make import (
     WIDTHS,
     Axis,
     Block,
+    Box,
+    Hierarchy,
     Node,
+    Plain,
     Plan,
     Slot,
     Strip,
     Values,
+    around,
     bits32,
+    cell_tree,
     content,
+    corners_of,
     decoding,
     encode,
     f32,
     fold,
+    heap_tree,
+    loose_tree,
+    object_boxes,
     place,
     plain_nodes,
+    plain_of,
     planes,
+    presort,
     streams,
 )
 
@@ -134,7 +145,7 @@ def valid_plans() -> dict[str, tuple[str, Plan]]:
     }
     for group in (_turns(), _limits(), _widths(), _exponents(), _floats(), _boxes(), _containers(), _sides()):
         made |= group
-    for group in (_attributes(), _origins(), _instances()):
+    for group in (_attributes(), _origins(), _instances(), _hierarchies()):
         made |= group
     return made
 
@@ -550,6 +561,10 @@ def invalid_files() -> dict[str, tuple[str, list[str], bytes]]:
         _values(),
         _materials(),
         _geometries(),
+        _other_hierarchies(),
+        _trees_of_cells(),
+        _presorted(),
+        _plain(),
         _matrices(),
         _streams(),
     ):
@@ -607,7 +622,8 @@ def _headers() -> dict[str, tuple[str, list[str], bytes]]:
         "other_file": ("a file of another kind", ["RDM102"], b"ply\nformat ascii 1.0\nend_header\n"),
         "major_1": wrong("a version to come", "RDM103", ONE, header={"major": 1}),
         "minor_5": wrong("a version to come", "RDM103", ONE, header={"minor": 5}),
-        "minor_3": wrong("a version gone", "RDM103", ONE, header={"minor": 3}),
+        "minor_3": wrong("the version before", "RDM103", ONE, header={"minor": 3}),
+        "minor_2": wrong("a version gone", "RDM103", ONE, header={"minor": 2}),
         "no_sections": wrong("no sections", "RDM105", ONE, header={"section_count": 0}),
         "sections_65": wrong(
             "one section too many", "RDM105", ONE, extra=[(f"X{i:03}", 0, 0, b"x") for i in range(62)]
@@ -1394,6 +1410,279 @@ def _renamed(made: dict, at: int) -> None:
 def _window(data: bytes, byte: int) -> bytes:
     plain = frame(data, descriptor=0)
     return plain[:5] + bytes([byte]) + plain[5:]
+
+
+# Hierarchies of other kinds
+
+NINE = blocks_of(3, 3)
+"""Nine triangles, three strips in three blocks."""
+LOOSE, HEAP, CELLS, PRESORTED = 3, 1, 2, 4
+
+
+def bvh(
+    kind: int, blocks: list[Block], over: int = 0, order: list[int] | None = None, leaf: int = 1
+) -> Hierarchy:
+    """A BVH of kind 1 or 3 over objects in an order."""
+    boxes = object_boxes(blocks, over)
+    placed = [boxes[i] for i in order or range(len(boxes))]
+    nodes = heap_tree(placed) if kind == HEAP else loose_tree(placed, leaf)
+    return Hierarchy(kind, over, nodes, order or [], int(order is not None))
+
+
+def cells_over(blocks: list[Block], over: int, depth: int) -> Hierarchy:
+    """A kd-tree over objects."""
+    nodes, references, root = cell_tree(object_boxes(blocks, over), depth)
+    return Hierarchy(CELLS, over, nodes, references, bounds=root)
+
+
+def presorted(blocks: list[Block], sizes: list[int] | None = None, **fields) -> Plan:
+    """Presorted triangles: one tree without nodes, or trees of these sizes under a BVH."""
+    corners = corners_of(blocks)
+    boxes = object_boxes(blocks, 0)
+    starts = [sum((sizes or [len(boxes)])[:i]) for i in range(len(sizes or [0]) + 1)]
+    parts = [range(a, b) for a, b in pairwise(starts)]
+    trees = [around([boxes[i] for i in part]) for part in parts]
+    orders = [presort([boxes[i] for i in part]) for part in parts]
+    order = [part[i] for part, row in zip(parts, orders, strict=True) for i in row]
+    nodes = loose_tree(trees) if sizes else []
+    nodes = [node if node[7] == 0 else (*node[:6], starts[node[6]], len(parts[node[6]])) for node in nodes]
+    hierarchy = Hierarchy(PRESORTED, 0, nodes, starts)
+    return Plan([], hierarchy=hierarchy, plain=plain_of([corners[i] for i in order]), **fields)
+
+
+def chain(boxes: list[Box]) -> list[tuple]:
+    """A BVH in preorder whose every first child is a leaf."""
+    nodes = []
+    for i in range(len(boxes) - 1):
+        nodes += [(*around(boxes[i:]), 2 * i + 2, 0), (*boxes[i], i, 1)]
+    return [*nodes, (*boxes[-1], len(boxes) - 1, 1)]
+
+
+def _hierarchies() -> dict[str, tuple[str, Plan]]:
+    back = [2, 0, 1]
+    made = {
+        "heap_one": ("an SLBVH of one leaf", Plan([TRIANGLE], hierarchy=bvh(HEAP, [TRIANGLE]))),
+        "heap_triangles": ("an SLBVH over triangles", Plan(NINE, hierarchy=bvh(HEAP, NINE))),
+        "heap_strips": ("an SLBVH over strips in an order", Plan(NINE, hierarchy=bvh(HEAP, NINE, 1, back))),
+        "heap_blocks": ("an SLBVH over blocks", Plan(NINE, hierarchy=bvh(HEAP, NINE, 2))),
+        "loose_one": ("a loose octree's BVH of one leaf", Plan([TRIANGLE], hierarchy=bvh(LOOSE, [TRIANGLE]))),
+        "loose_triangles": ("leaves of two", Plan(NINE, hierarchy=bvh(LOOSE, NINE, leaf=2))),
+        "loose_strips": ("strips in an order", Plan(NINE, hierarchy=bvh(LOOSE, NINE, 1, back))),
+        "loose_blocks": ("blocks in an order", Plan(NINE, hierarchy=bvh(LOOSE, NINE, 2, back))),
+        "cells_one": ("a kd-tree of one leaf", Plan([TRIANGLE], hierarchy=cells_over([TRIANGLE], 0, 0))),
+        "cells_triangles": ("a kd-tree over triangles", Plan(NINE, hierarchy=cells_over(NINE, 0, 3))),
+        "cells_strips": ("a kd-tree over strips", Plan(NINE, hierarchy=cells_over(NINE, 1, 4))),
+        "presorted": ("presorted triangles, one tree", presorted(NINE)),
+        "presorted_one": ("one presorted triangle", presorted([TRIANGLE])),
+        "presorted_trees": ("three presorted trees under nodes", presorted(NINE, [4, 2, 3])),
+        "presorted_one_tree": ("one presorted tree under a node", presorted(NINE, [9])),
+    }
+    many = [Block([zigzag(128)], points(130))]
+    made["loose_deepest"] = (
+        "a chain of 128 nodes",
+        Plan(many, hierarchy=Hierarchy(3, 0, chain(object_boxes(many, 0)))),
+    )
+    grown = bvh(LOOSE, NINE, leaf=3)
+    wide = [(*(x - 1.0 for x in node[:3]), *(x + 1.0 for x in node[3:6]), *node[6:]) for node in grown.nodes]
+    made["loose_wide"] = ("boxes larger than need be", Plan(NINE, hierarchy=grown._replace(nodes=wide)))
+    sided = presorted(NINE, remap=[(i, i % 3) for i in range(9)], metadata={"unit": "mm"}, grid=0)
+    colours = Values("COLR", 2, 1, [(1, 2, 3), (4, 5, 6)], [0, 1, 1, 0, 0, 1, 0, 0, 1])
+    vertices = Values(
+        "NORM", 0, 0, [UP, EAST], [0, 1] + [0] * (len(sided.plain.points if sided.plain else []) - 2)
+    )
+    made["presorted_sides"] = ("with remap, values, grid", replace(sided, attributes=[vertices, colours]))
+    for kind in ("HIER", "TRIS"):
+        made[f"planes_{kind.lower()}"] = (
+            f"{kind} in planes",
+            replace(sided, packed={kind: lambda data: frame(planes(data, 4))}, codecs={kind: 3}),
+        )
+        made[f"zstd_{kind.lower()}"] = (f"{kind} packed", replace(sided, packed={kind: frame}))
+    return made
+
+
+def _changed(plan: Plan, node: int, place: int, value: float) -> Plan:
+    """A plan with one number of a node of its hierarchy changed."""
+    assert plan.hierarchy
+    nodes = [list(row) for row in plan.hierarchy.nodes]
+    nodes[node][place] = value
+    return replace(plan, hierarchy=plan.hierarchy._replace(nodes=[tuple(row) for row in nodes]))
+
+
+def _with_items(plan: Plan, items: list[int]) -> Plan:
+    assert plan.hierarchy
+    return replace(plan, hierarchy=plan.hierarchy._replace(items=items))
+
+
+def _with_record(plan: Plan, tail: bytes = b"", **record) -> Plan:
+    assert plan.hierarchy
+    return replace(plan, hierarchy=plan.hierarchy._replace(record=record, tail=tail))
+
+
+def _other_hierarchies() -> dict[str, tuple[str, list[str], bytes]]:
+    heap = Plan(NINE, hierarchy=bvh(HEAP, NINE, 1, [2, 0, 1]))
+    loose = Plan(NINE, hierarchy=bvh(LOOSE, NINE, 1, [2, 0, 1]))
+    two = Plan(NINE, hierarchy=bvh(LOOSE, NINE, leaf=2))
+    tree = Plan(NINE, hierarchy=cells_over(NINE, 0, 2))
+    many = [Block([zigzag(129)], points(131))]
+    deep = Plan(many, hierarchy=Hierarchy(3, 0, chain(object_boxes(many, 0))))
+    placed = Plan(NINE, hierarchy=bvh(HEAP, NINE), geometries=[(0, 0, 0, 9)], instances=[(0, 0, IDENTITY)])
+    made = {
+        "unknown": ("RDM561", _with_record(heap, kind=5), "a kind that is not known"),
+        "none": ("RDM561", _with_record(heap, kind=0), "no kind"),
+        "over": ("RDM561", _with_record(heap, over=3), "objects that are not known"),
+        "cells_over_blocks": ("RDM561", _with_record(tree, over=2), "a kd-tree over blocks"),
+        "cells_ordered": ("RDM561", _with_record(tree, flags=1), "a kd-tree with an order"),
+        "reserved": ("RDM107", _with_record(heap, reserved=1), "a reserved byte"),
+        "reserved_2": ("RDM107", _with_record(loose, reserved_2=1), "a reserved word"),
+        "reserved_3": ("RDM107", _with_record(loose, reserved_3=b"\1"), "reserved bytes"),
+        "flags": ("RDM107", _with_record(loose, flags=3), "a reserved flag"),
+        "bounds": ("RDM563", _with_record(loose, high_z=1.0), "a cell that is not needed"),
+        "more_nodes": ("RDM562", _with_record(loose, node_count=6), "a node that is not there"),
+        "huge": ("RDM562", _with_record(loose, node_count=2**32 - 1), "as many nodes as can be told"),
+        "longer": ("RDM562", _with_record(loose, bytes(4)), "a word behind the items"),
+        "no_order": ("RDM562", _with_record(heap, flags=0), "items without an order"),
+        "order_missing": ("RDM562", _with_items(heap, []), "an order without items"),
+        "order_short": ("RDM562", _with_items(heap, [1, 0]), "an order of too few"),
+        "order_twice": ("RDM567", _with_items(heap, [1, 0, 1]), "an object twice"),
+        "order_outside": ("RDM567", _with_items(loose, [3, 0, 1]), "an object that is not there"),
+        "order_far": ("RDM567", _with_items(loose, [2**32 - 1, 0, 1]), "an object far beyond"),
+        "heap_child": ("RDM564", _changed(heap, 4, 6, 1 << 3), "an inner node without room for children"),
+        "heap_lost": ("RDM564", _changed(heap, 7, 6, 1 << 3 | 4), "a node below a leaf"),
+        "heap_first": ("RDM564", _changed(heap, 0, 7, 1), "a node 0"),
+        "heap_axis": ("RDM563", _changed(heap, 1, 6, 3 << 3 | 3), "no axis"),
+        "heap_leaf_axis": ("RDM563", _changed(heap, 3, 6, 1 << 3 | 5), "a leaf with an axis"),
+        "heap_count": ("RDM566", _changed(heap, 1, 6, 4 << 3), "a root that holds too many"),
+        "heap_place": ("RDM566", _changed(heap, 3, 7, 1), "a leaf that holds another place"),
+        "heap_box": ("RDM568", _changed(heap, 1, 3, 5.0), "a box that is too small"),
+        "heap_nan": ("RDM568", _changed(heap, 2, 0, float("nan")), "a box that is none"),
+        "loose_second": ("RDM564", _changed(loose, 0, 6, 4), "a second child that is another's"),
+        "loose_far": ("RDM564", _changed(loose, 0, 6, 99), "a second child that is not there"),
+        "loose_open": ("RDM564", _changed(loose, 1, 7, 0), "a leaf that is no leaf"),
+        "loose_closed": ("RDM564", _changed(loose, 0, 7, 3), "nodes behind the last"),
+        "loose_deep": ("RDM565", deep, "a chain of 129 nodes"),
+        "loose_place": ("RDM566", _changed(loose, 1, 6, 1), "a place twice"),
+        "loose_outside": ("RDM566", _changed(loose, 4, 6, 7), "a place that is not there"),
+        "loose_few": ("RDM566", _changed(two, 2, 7, 1), "a place in no leaf"),
+        "loose_box": ("RDM568", _changed(loose, 1, 0, 9.0), "a box that is too small"),
+        "of_no_nodes": ("RDM562", replace(loose, hierarchy=Hierarchy(3, 2, [])), "no node"),
+        "heap_odd": (
+            "RDM562",
+            replace(heap, hierarchy=bvh(LOOSE, NINE)._replace(kind=1)),
+            "a heap of 17 nodes",
+        ),
+        "stored": ("RDM201", replace(heap, record={"flags": 1}), "boxes inside blocks beside it"),
+        "nodes_beside": ("RDM201", replace(heap, nodes=plain_nodes(NINE, None), top=1), "nodes beside it"),
+        "with_instances": ("RDM117", placed, "instances beside it"),
+        "empty": ("RDM117", Plan([], hierarchy=Hierarchy(3, 0, [])), "a hierarchy of an empty scene"),
+    }
+    files = {f"hierarchy_{name}": wrong(about, codes, plan) for name, (codes, plan, about) in made.items()}
+    files["hierarchy_stored"][1].append("RDM207")
+    files["hierarchy_stored"][1].append("RDM113")
+    files["hierarchy_short"] = wrong("63 bytes", "RDM562", heap, payloads={"HIER": lambda data: data[:63]})
+    files["hierarchy_long"] = wrong(
+        "too many bytes", "RDM114", heap, payloads={"HIER": lambda d: d + bytes(2**14)}
+    )
+    files["hierarchy_passed_over"] = wrong(
+        "not to be understood", "RDM116", heap, entries={"HIER": {"flags": 0}}
+    )
+    return files
+
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def _trees_of_cells() -> dict[str, tuple[str, list[str], bytes]]:
+    tree = Plan(NINE, hierarchy=cells_over(NINE, 0, 2))
+    assert tree.hierarchy
+    root, items, count = tree.hierarchy.bounds, tree.hierarchy.items, len(tree.hierarchy.nodes)
+    held = tree.hierarchy.nodes[2][1] >> 2
+    small = tree.hierarchy._replace(bounds=(*root[:3], root[3] - 1.0, *root[4:]))
+    far = tree.hierarchy._replace(bounds=(*root[:5], float("inf")))
+    swapped = [items[1], items[0], *items[2:]]
+    lacking = [8 if i == 0 else item for i, item in enumerate(items)]
+    made = {
+        "plane": ("RDM563", _changed(tree, 0, 0, bits32(root[3] + 1.0)), "a plane out of its cell"),
+        "nan": ("RDM563", _changed(tree, 1, 0, 0x7FC00000), "a plane that is none"),
+        "second": ("RDM564", _changed(tree, 0, 1, 5 << 2), "a child that is another's"),
+        "axis": ("RDM564", _changed(tree, 0, 1, 3), "an inner node that is a leaf"),
+        "far": ("RDM564", _changed(tree, 0, 1, 2**32 - 4), "a child that is not there"),
+        "count": ("RDM566", _changed(tree, 2, 1, held + 1 << 2 | 3), "a leaf that has a reference too many"),
+        "first": ("RDM566", _changed(tree, 2, 0, 1), "a leaf that has another's"),
+        "left": ("RDM566", _with_items(tree, [*items, 8]), "a reference too many"),
+        "falling": ("RDM567", _with_items(tree, swapped), "references that fall"),
+        "outside": ("RDM567", _with_items(tree, [*items[:-1], 9]), "an object that is not there"),
+        "root": ("RDM568", replace(tree, hierarchy=small), "a root's cell that is too small"),
+        "infinite": ("RDM563", replace(tree, hierarchy=far), "a root's cell without an end"),
+    }
+    files = {f"cells_{name}": wrong(about, codes, plan) for name, (codes, plan, about) in made.items()}
+    one = cells_over([TRIANGLE], 0, 0)
+    files["cells_empty"] = wrong(
+        "a triangle in no leaf", "RDM568", ONE, hierarchy=one._replace(nodes=[(0, 3)], items=[])
+    )
+    files["cells_none"] = wrong("no node", "RDM562", ONE, hierarchy=one._replace(nodes=[], items=[]))
+    assert count == 7
+    assert lacking != items
+    return files
+
+
+def _presorted() -> dict[str, tuple[str, list[str], bytes]]:
+    one, trees = presorted(NINE), presorted(NINE, [4, 2, 3])
+    assert one.plain
+    faces = one.plain.faces
+    turned = plain_of([[one.plain.points[i] for i in face] for face in reversed(faces)])
+    made = {
+        "starts_late": ("RDM567", _with_items(one, [1, 9]), "a first tree that begins late"),
+        "starts_short": ("RDM567", _with_items(one, [0, 8]), "a last tree that ends early"),
+        "starts_twice": ("RDM567", _with_items(trees, [0, 4, 4, 9]), "a tree without a triangle"),
+        "no_tree": ("RDM562", _with_items(one, [0]), "no tree"),
+        "several": ("RDM562", _with_items(one, [0, 4, 9]), "two trees without a node"),
+        "leaf": ("RDM566", _changed(trees, 1, 7, 3), "a leaf with another tree"),
+        "leaf_first": ("RDM566", _changed(trees, 1, 6, 1), "a leaf with another beginning"),
+        "child": ("RDM564", _changed(trees, 0, 6, 1), "a second child that is the first"),
+        "box": ("RDM568", _changed(trees, 0, 3, 1.0), "a box that is too small"),
+        "slab": ("RDM568", replace(one, plain=turned), "triangles in another order"),
+        "over": ("RDM561", _with_record(one, over=1), "presorted strips"),
+        "no_triangles": ("RDM113", replace(one, drop=("TRIS",)), "no plain triangles"),
+    }
+    files = {f"presorted_{name}": wrong(about, codes, plan) for name, (codes, plan, about) in made.items()}
+    # Without the triangles nothing says that there may be no block.
+    files["presorted_no_triangles"][1].append("RDM201")
+    fields = {"triangle_count": 9, "source_face_count": 9}
+    beside = replace(Plan(NINE, hierarchy=one.hierarchy), plain=one.plain, record=fields)
+    files["presorted_beside_blocks"] = wrong("blocks beside plain triangles", "RDM201 RDM568", beside)
+    return files
+
+
+def _plain() -> dict[str, tuple[str, list[str], bytes]]:
+    one = presorted([TRIANGLE])
+    nine = presorted(NINE)
+    assert nine.plain
+    assert one.plain
+    points, faces = nine.plain
+    alone = Plan([TRIANGLE], plain=one.plain, record={"triangle_count": 1})
+    made = {
+        "outside": ("RDM571", Plain(points, [*faces[:-1], [0, 1, len(points)]])),
+        "late": ("RDM572", Plain(points, [[faces[0][1], faces[0][0], faces[0][2]], *faces[1:]])),
+        "unused": ("RDM573", Plain([*points, (1.0, 1.0, 1.0)], faces)),
+    }
+    files = {f"plain_{name}": wrong(name, codes, nine, plain=plain) for name, (codes, plain) in made.items()}
+    twice = presorted([Block([Strip([0, 1, 2]), Strip([2, 1, 0])], TRIANGLE.points)])
+    assert twice.plain
+    again = [twice.plain.faces[0], [0, 1, 0]]
+    files["plain_repeated"] = wrong(
+        "a vertex twice", "RDM574", twice, plain=twice.plain._replace(faces=again)
+    )
+    endless = Plain([*points[:-1], (float("inf"), 1.0, 1.0)], faces)
+    files["plain_infinite"] = wrong(
+        "a point without an end", "RDM575", nine, plain=endless, record={"high_x": nine.bounds[3]}
+    )
+    files["plain_off_grid"] = wrong("no multiple of 8", "RDM204", nine, grid=3)
+    files["plain_bounds"] = wrong("other bounds", "RDM205", nine, record={"high_x": 99.0})
+    files["plain_odd"] = wrong("a byte more", "RDM114", nine, payloads={"TRIS": lambda data: data + b"\0"})
+    files["plain_few"] = wrong("too few vertices", "RDM114", one, payloads={"TRIS": lambda data: data[12:]})
+    files["plain_alone"] = wrong("no hierarchy", "RDM117", alone)
+    files["plain_alone"][1].append("RDM201")
+    return files
 
 
 def all_files() -> dict[str, bytes]:

@@ -19,8 +19,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 MAGIC = b"\x89RDM\r\n\x1a\n"
-MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST")
-ORDER = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "RMAP", "ATTR", "MATL", "META", "GEOM", "INST")
+MUST_UNDERSTAND = ("SCEN", "BLKH", "BLKD", "NODE", "RUNS", "GEOM", "INST", "HIER", "TRIS")
+ORDER = (
+    "SCEN",
+    "BLKH",
+    "BLKD",
+    "NODE",
+    "RUNS",
+    "RMAP",
+    "ATTR",
+    "MATL",
+    "META",
+    "GEOM",
+    "INST",
+    "HIER",
+    "TRIS",
+)
 RECORD = {
     **dict.fromkeys(("triangle_count", "block_count", "node_count", "top_count", "run_count"), "I"),
     **{"source_face_count": "I", "flags": "B", "reserved": "B", "grid_exponent": "h", "reserved_2": "I"},
@@ -204,7 +218,7 @@ def walk(strip: Strip) -> list[list[int]]:
 
 # Codecs
 
-WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4}
+WIDTHS = {"BLKH": 32, "NODE": 64, "RUNS": 4, "RMAP": 4, "HIER": 4, "TRIS": 4}
 
 
 def planes(data: bytes, width: int) -> bytes:
@@ -496,6 +510,192 @@ def decoded_attributes(attributes: list[Values]) -> dict:
     }
 
 
+# Hierarchies of other kinds
+
+
+class Hierarchy(NamedTuple):
+    """What HIER is to hold; a node is `(*low, *high, a, b)`, or `(a, b)` in a kd-tree.
+
+    `record` has fields of its record that hold something else, `tail` bytes behind the items.
+    """
+
+    kind: int
+    over: int
+    nodes: list[tuple]
+    items: list[int] = []  # noqa: RUF012
+    flags: int = 0
+    bounds: tuple[float, ...] = (0.0,) * 6
+    record: dict = {}  # noqa: RUF012
+    tail: bytes = b""
+
+
+class Plain(NamedTuple):
+    """What TRIS is to hold: points, and triangles of three numbers of points."""
+
+    points: list[tuple[float, float, float]]
+    faces: list[list[int]]
+
+
+BOUNDS = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
+HIERARCHY = {
+    **{"kind": "B", "over": "B", "flags": "B", "reserved": "B"},
+    **{"node_count": "I", "item_count": "I", "reserved_2": "I"},
+    **dict.fromkeys(BOUNDS, "f"),
+    **{"reserved_3": "24s"},
+}
+
+
+def encode_hierarchy(hierarchy: Hierarchy) -> bytes:
+    """The bytes of HIER."""
+    fields = {"kind": hierarchy.kind, "over": hierarchy.over, "flags": hierarchy.flags, "reserved": 0}
+    fields |= {"node_count": len(hierarchy.nodes), "item_count": len(hierarchy.items), "reserved_2": 0}
+    fields |= dict(
+        zip(("low_x", "low_y", "low_z", "high_x", "high_y", "high_z"), hierarchy.bounds, strict=True)
+    )
+    head = record(HIERARCHY, fields | {"reserved_3": b""} | hierarchy.record)
+    return head + b"".join(map(pack_node, hierarchy.nodes)) + pack_items(hierarchy.items) + hierarchy.tail
+
+
+def pack_node(node: tuple) -> bytes:
+    """The bytes of a node: floats but for the last two."""
+    return struct.pack(f"<{len(node) - 2}f2I", *node)
+
+
+def pack_items(items: list[int]) -> bytes:
+    """The bytes of items."""
+    return struct.pack(f"<{len(items)}I", *items)
+
+
+def encode_plain(plain: Plain) -> bytes:
+    """The bytes of TRIS."""
+    points = b"".join(struct.pack("<3f", *point) for point in plain.points)
+    return points + b"".join(struct.pack("<3I", *face) for face in plain.faces)
+
+
+def decoded_hierarchy(hierarchy: Hierarchy) -> list:
+    """Kind, objects, nodes as words and items, as a reader gives them."""
+    nodes = [list(struct.unpack(f"<{len(node)}I", pack_node(node))) for node in hierarchy.nodes]
+    return [hierarchy.kind, hierarchy.over, nodes, hierarchy.items]
+
+
+Box = tuple[float, ...]
+
+
+def corners_of(blocks: list[Block]) -> list[list[tuple[float, float, float]]]:
+    """The corners of each triangle."""
+    return [
+        [block.points[v] for v in face] for block in blocks for strip in block.strips for face in walk(strip)
+    ]
+
+
+def box_of(points: list[tuple[float, float, float]]) -> Box:
+    """The box around points."""
+    columns = list(zip(*points, strict=True))
+    return (*(min(c) for c in columns), *(max(c) for c in columns))
+
+
+def object_boxes(blocks: list[Block], over: int) -> list[Box]:
+    """The boxes of triangles, strips or blocks."""
+    if over == 2:
+        return [box_of(block.points) for block in blocks]
+    if over == 1:
+        return [box_of([block.points[v] for v in strip.index]) for block in blocks for strip in block.strips]
+    return [box_of(corners) for corners in corners_of(blocks)]
+
+
+def around(boxes: list[Box]) -> Box:
+    """The box around boxes."""
+    return box_of([corner for box in boxes for corner in (box[:3], box[3:])])
+
+
+def loose_tree(boxes: list[Box], leaf: int = 1) -> list[tuple]:
+    """A BVH in preorder over places with these boxes, halved until leaves are small."""
+    nodes: list[tuple] = []
+
+    def grow(first: int, count: int) -> None:
+        at, box = len(nodes), around(boxes[first : first + count])
+        nodes.append((*box, first, count))
+        if count > leaf:
+            grow(first, count // 2)
+            nodes[at] = (*box, len(nodes), 0)
+            grow(first + count // 2, count - count // 2)
+
+    grow(0, len(boxes))
+    return nodes
+
+
+def heap_tree(boxes: list[Box]) -> list[tuple]:
+    """An SLBVH over places with these boxes, one a leaf."""
+    nodes: list[tuple] = [(0.0,) * 6 + (0, 0)] * (2 << (len(boxes) - 1).bit_length())
+
+    def grow(at: int, first: int, count: int) -> None:
+        box = around(boxes[first : first + count])
+        nodes[at] = (*box, count << 3 | (4 if count == 1 else first % 3), first)
+        if count > 1:
+            grow(2 * at, first, count - count // 2)
+            grow(2 * at + 1, first + count - count // 2, count // 2)
+
+    grow(1, 0, len(boxes))
+    return nodes
+
+
+def cell_tree(boxes: list[Box], depth: int) -> tuple[list[tuple], list[int], Box]:
+    """A kd-tree over objects with these boxes: nodes, references, the root's cell."""
+    nodes: list[tuple] = []
+    references: list[int] = []
+
+    def grow(cell: Box, objects: list[int], left: int) -> None:
+        at = len(nodes)
+        if left == 0:
+            nodes.append((len(references), len(objects) << 2 | 3))
+            references.extend(objects)
+            return
+        axis = (depth - left) % 3
+        plane = f32(bits32((cell[axis] + cell[axis + 3]) / 2))
+        nodes.append(())
+        below = (*cell[: axis + 3], plane, *cell[axis + 4 :])
+        grow(below, [i for i in objects if boxes[i][axis] <= plane], left - 1)
+        nodes[at] = (bits32(plane), len(nodes) << 2 | axis)
+        above = (*cell[:axis], plane, *cell[axis + 1 :])
+        grow(above, [i for i in objects if boxes[i][axis + 3] >= plane], left - 1)
+
+    root = around(boxes)
+    grow(root, list(range(len(boxes))), depth)
+    return nodes, references, root
+
+
+def presort(boxes: list[Box]) -> list[int]:
+    """The order in which triangles with these boxes are one presorted tree."""
+    count, order = -(-len(boxes) // 2), [-1] * len(boxes)
+
+    def held(node: int) -> int:
+        own = max(0, min(2, len(boxes) - 2 * node))
+        return own + held(2 * node + 1) + held(2 * node + 2) if node < count else 0
+
+    def place(node: int, items: list[int], axis: int) -> None:
+        if not items:
+            return
+        first = min(items, key=lambda i: (boxes[i][axis], -boxes[i][axis + 3], i))
+        rest = [i for i in items if i != first]
+        order[2 * node] = first
+        if rest:
+            order[2 * node + 1] = max(rest, key=lambda i: (boxes[i][axis + 3], -i))
+            rest.remove(order[2 * node + 1])
+        middle = held(2 * node + 1)
+        place(2 * node + 1, rest[:middle], (axis + 1) % 3)
+        place(2 * node + 2, rest[middle:], (axis + 1) % 3)
+
+    place(0, list(range(len(boxes))), 0)
+    return order
+
+
+def plain_of(corners: list[list[tuple[float, float, float]]]) -> Plain:
+    """Triangles with vertices in the order of their first use."""
+    number: dict[tuple, int] = {}
+    faces = [[number.setdefault(tuple(map(bits32, point)), len(number)) for point in row] for row in corners]
+    return Plain([tuple(f32(bits) for bits in point) for point in number], faces)
+
+
 # Files
 
 
@@ -515,6 +715,8 @@ class Plan:
         geometries: `(first_block, first_top, first_face, face_count)` of each, if any; nodes are to be given
             with them.
         instances: `(geometry, first_face, matrix)` of each, the matrix twelve numbers, if any.
+        hierarchy: What HIER is to hold, if it is there; nodes are then none.
+        plain: What TRIS is to hold, if it is there.
         metadata: An object, or the bytes of META.
         grid: The grid exponent.
         cells: The exponents of the cells of plain nodes.
@@ -541,6 +743,8 @@ class Plan:
     materials: list | bytes | None = None
     geometries: list[tuple[int, int, int, int]] = field(default_factory=list)
     instances: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
+    hierarchy: Hierarchy | None = None
+    plain: Plain | None = None
     metadata: dict | bytes | None = None
     grid: int | None = None
     cells: tuple[int, int, int] = (0, 0, 0)
@@ -561,7 +765,7 @@ class Plan:
         if self.stored and self.runs is None:
             self.runs = cut_runs(self.blocks)
         if self.nodes is None:
-            wanted = self.stored or len(self.blocks) > 1
+            wanted = self.stored or (len(self.blocks) > 1 and self.hierarchy is None)
             self.nodes = plain_nodes(self.blocks, self.runs, self.cells) if wanted else []
         if self.top is None:
             plain = len(plain_nodes(self.blocks, None, self.cells)) if len(self.blocks) > 1 else 0
@@ -570,7 +774,14 @@ class Plan:
     @property
     def count(self) -> int:
         """Triangles."""
-        return sum(block.count for block in self.blocks)
+        return sum(block.count for block in self.blocks) + len(self.plain.faces if self.plain else [])
+
+    @property
+    def bounds(self) -> list[float]:
+        """The six bounds of all points."""
+        if self.plain:
+            return [side + 0.0 for side in box_of(self.plain.points)]
+        return scene_bounds(self.blocks) if self.blocks else [0.0] * 6
 
 
 def encode(plan: Plan) -> bytes:
@@ -650,12 +861,13 @@ def sections(plan: Plan) -> dict[str, bytes]:
     geometries = b"".join(struct.pack("<4I", *row) for row in plan.geometries)
     instances = b"".join(struct.pack("<2I12d", *row[:2], *row[2]) for row in plan.instances)
     made += (attributes, materials, metadata, geometries, instances)
+    made += (encode_hierarchy(plan.hierarchy) if plan.hierarchy else b"",)
+    made += (encode_plain(plan.plain) if plan.plain else b"",)
     return dict(zip(ORDER, made, strict=True))
 
 
 def scene_record(plan: Plan) -> dict:
     """The fields of SCEN."""
-    bounds = scene_bounds(plan.blocks) if plan.blocks else [0.0] * 6
     names = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
     return {
         "triangle_count": plan.count,
@@ -669,7 +881,7 @@ def scene_record(plan: Plan) -> dict:
         "grid_exponent": plan.grid or 0,
         "reserved_2": 0,
         "error_bound": 0.0,
-        **dict(zip(names, bounds, strict=True)),
+        **dict(zip(names, plan.bounds, strict=True)),
         **dict(zip(("cell_x", "cell_y", "cell_z"), plan.cells, strict=True)),
         "longest_run": 8 if plan.stored else 0,
         "origin_x": 0.0,
@@ -689,6 +901,9 @@ def decoding(plan: Plan) -> dict:
         faces += [[first + v for v in face] for strip in block.strips for face in walk(strip)]
         vertices += ["".join(f"{bits32(x):08x}" for x in point) for point in block.points]
         first += len(block.points)
+    if plan.plain:
+        faces = plan.plain.faces
+        vertices = ["".join(f"{bits32(x):08x}" for x in point) for point in plan.plain.points]
     fields = scene_record(plan)
     skipped = [kind for kind, *_ in plan.extra]
     metadata = plan.metadata or {}
@@ -707,6 +922,7 @@ def decoding(plan: Plan) -> dict:
         "packed": sorted(plan.packed),
         **({"attributes": decoded_attributes(plan.attributes)} if plan.attributes else {}),
         **({"materials": plan.materials} if plan.materials else {}),
+        **({"hierarchy": decoded_hierarchy(plan.hierarchy)} if plan.hierarchy else {}),
         **({"geometries": plan.geometries, "instances": plan.instances} if plan.instances else {}),
     }
 

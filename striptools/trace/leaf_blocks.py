@@ -1,0 +1,43 @@
+"""The test of a leaf block: eight triangles as `kernels.wide.fill_leaf_blocks` writes them.
+
+Every walk over expanded triangles tests them here, so that t is the same bit for bit whichever hierarchy led
+to them.
+"""
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from striptools.trace.triangle import Shear, crossing_of, edges_of
+from striptools.trace.walk import NO_NAME, WIDTH, Best, replaced
+
+
+def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
+    """Test the triangles of a block, each lane against its own closest hit.
+
+    Args:
+        blocks: (l, 10, 8) float32, rows of x, y and z of corners a, b and c, then the bits of faces.
+        block: () uint32, which of them.
+        shear: Of the ray.
+        best: What was found so far.
+    """
+
+    def corners(axis: Array) -> tuple[Array, Array, Array]:
+        rows = lax.dynamic_slice(blocks, (block, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
+        return rows[0], rows[1], rows[2]
+
+    x, y, z = (corners(axis) for axis in shear.axes)
+    t = crossing_of(edges_of(x, y, z, shear))
+    face = faces_in(blocks, block)
+    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))
+    return replaced(best, closer, t, face)
+
+
+def faces_in(blocks: Array, block: Array) -> Array:
+    """(8,) int32: the face in each lane, `NO_NAME` where there is none."""
+    bits = lax.dynamic_slice(blocks, (block, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
+    return lax.bitcast_convert_type(bits, jnp.int32)
+
+
+def triangles_in(blocks: Array, block: Array) -> Array:
+    """() int32: how many triangles a block has."""
+    return jnp.where(faces_in(blocks, block) == NO_NAME, 0, 1).sum().astype(jnp.int32)

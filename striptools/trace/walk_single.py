@@ -1,0 +1,125 @@
+"""Walks that follow one ray at a time: what those of the other hierarchies share.
+
+A walk is a function of one ready ray, compiled to a native loop on a CPU (one ray after the other) and
+batched by vmap on a GPU. What it may do is told in `walk`: nothing in its loop scatters, sorts or calls back.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from striptools.trace.counters import KINDS, Counters
+from striptools.trace.leaf_blocks import test_block, triangles_in
+from striptools.trace.numerics import index
+from striptools.trace.walk import (
+    DONE,
+    MISS,
+    STUCK,
+    WIDTH,
+    Best,
+    ReadyRay,
+    Traced,
+    WalkOptions,
+    closest_name,
+    ready_ray,
+)
+
+
+class Leaves(NamedTuple):
+    """Leaves of any size: rows of leaf blocks.
+
+    Attributes:
+        blocks: (l, 10, 8) float32, see `leaf_blocks`.
+        first: (k+1,) int32, the first block of each leaf, then their end; of as many leaves as there are and
+            those that fill up the size class, which are empty.
+    """
+
+    blocks: Any
+    first: Any
+
+
+class Ended(NamedTuple):
+    """How a walk ended.
+
+    Attributes:
+        best: The closest hit.
+        counters: Of the ray; anything where nothing is counted.
+        stuck: () bool, the walk was stopped at its bound.
+    """
+
+    best: Best
+    counters: Counters
+    stuck: Array
+
+
+Walk = Callable[[ReadyRay, Array], tuple[Array, Ended]]
+"""A walk of a live ray and a stack to the stack as it is left and how it ended."""
+
+
+def walk_each(ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> Traced:
+    """Walk r rays by a function of one.
+
+    Args:
+        ready: (r, 24) float32, as from `walk.prepared_rays`; rows of zeros are rays that end at once.
+        options: What to compile in.
+        walk: Of one ray. It is called for rays that are none too, of which it is told by `is_live`, and
+            should end at once.
+        stack: What a walk is given to write on: of any shape, without entries where it needs none. Ray after
+            ray uses the same; what one leaves the next must not need.
+    """
+
+    def one(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        ray = ready_ray(row)
+        stack, ended = walk(ray, stack)
+        name = closest_name(ended.best, options.any_hit)
+        t = jnp.where(name < 0, jnp.float32(jnp.inf), ended.best.nearest * ray.t_unit)
+        counted = jnp.stack([jnp.asarray(each, jnp.int32) for each in ended.counters])
+        counted = jnp.where(is_live(ray), counted, 0) if options.counting else jnp.zeros(0, jnp.int32)
+        return stack, (t, jnp.where(ended.stuck, STUCK, name), counted)
+
+    if options.batch:
+        t, name, counted = jax.vmap(lambda row: one(stack, row)[1])(ready)
+    else:
+        t, name, counted = lax.scan(one, stack, ready)[1]
+    return Traced(jnp.zeros(0) if options.any_hit else t, name, counted)
+
+
+def is_live(ray: ReadyRay) -> Array:
+    """() bool: whether there is anything to walk."""
+    return ray.start.child != DONE
+
+
+def no_counts() -> Counters:
+    """Zeros."""
+    return Counters(*(jnp.int32(0),) * KINDS)
+
+
+def nothing_yet(ray: ReadyRay) -> Best:
+    """What a ray has found before its walk."""
+    return Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32))
+
+
+def test_leaf(leaves: Leaves, leaf: Array, ray: ReadyRay, best: Best) -> Best:
+    """Test all triangles of a leaf, () uint32, block by block."""
+    first = leaves.first[leaf]
+    end = leaves.first[leaf + 1]
+
+    def test(carried: tuple[Array, Best]) -> tuple[Array, Best]:
+        block, best = carried
+        return block + 1, test_block(leaves.blocks, index(block), ray.shear, best)
+
+    return lax.while_loop(lambda carried: carried[0] < end, test, (first, best))[1]
+
+
+def triangles_in_leaf(leaves: Leaves, leaf: Array) -> Array:
+    """() int32: the triangles of a leaf; all of its blocks but the last are full."""
+    first, end = leaves.first[leaf], leaves.first[leaf + 1]
+    last = triangles_in(leaves.blocks, index(jnp.maximum(end - 1, 0)))
+    return jnp.where(end > first, (end - first - 1) * WIDTH + last, 0)
+
+
+BLOCK_BYTES = 320
+"""What testing a block reads."""
