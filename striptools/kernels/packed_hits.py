@@ -242,7 +242,7 @@ def weigh_packed_hits(
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32, not zero where there is a hit.
-        at: (k,) int32, the rays that results are for; others are left alone.
+        at: (k,) int32, the rays that results are for, negative for none; others are left alone.
         found_t: (k,) float32, t of each.
         found: (k,) int32, the triangle in file order; negative on a miss.
         headers: (b, 8) uint32.
@@ -263,6 +263,8 @@ def weigh_packed_hits(
     corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
         r = at[k]
+        if r < 0:
+            continue
         t[r] = found_t[k]
         face[r] = found[k]
         triangle[r] = found[k]
