@@ -224,7 +224,7 @@ class ReadyRay(NamedTuple):
     @property
     def start(self) -> "Place":
         """Where the walk starts."""
-        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
+        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1), jnp.uint32(0))
 
     @property
     def visited(self) -> Array:
@@ -242,12 +242,16 @@ class Mirrored(Protocol):
 
 
 class Place(NamedTuple):
-    """Where a ray is: the child to visit next, and the lanes left of the node it came from."""
+    """Where a ray is: the child to visit next, the lanes left of the node it came from, and the child's.
+
+    The lane is the place in the order of visits.
+    """
 
     child: Array
     node: Array
     lanes: Array
     height: Array
+    lane: Array
 
 
 def trace_rays(
@@ -349,7 +353,7 @@ def next_child(
     lanes = jnp.where(empty, top[1], lanes)
     order = 31 - lax.clz(lanes)
     child = scene.child_of(node, index(order ^ ray.mirror))
-    return Place(child, node, lanes ^ (jnp.int32(1) << order), height)
+    return Place(child, node, lanes ^ (jnp.int32(1) << order), height, index(order))
 
 
 def _visit_node(

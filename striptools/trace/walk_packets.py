@@ -21,6 +21,7 @@ Differences:
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -67,8 +68,17 @@ class LeafRows(NamedTuple):
 class PacketScene(WalkScene, Protocol):
     """What a walk of packets asks of a scene."""
 
-    def boxes_of(self, node: Array, axes: tuple[Array, Array, Array]) -> list[tuple[Array, Array]]:
-        """Low and high sides of a node's boxes along the axes, (8,) float32 scaled; NaN where is none."""
+    def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
+        """Sides of a node's boxes, (8,) float32 scaled each; NaN where there is none.
+
+        Args:
+            node: The node.
+            rows: Which sides: 0 to 2 are the low ones along x, y, z, 3 to 5 the high ones.
+        """
+        ...
+
+    def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
+        """Sides of the box in one lane, () float32 each, as of `sides_of`."""
         ...
 
     def leaf_rows(self, child: Array, axes: tuple[Array, Array, Array]) -> LeafRows:
@@ -81,35 +91,69 @@ class PacketScene(WalkScene, Protocol):
 
 
 class _Packet(NamedTuple):
-    """A packet: bounds of its rays, () each, and its rays, (32,) each.
+    """A packet, in as few arrays as can be: a loop pays for each.
 
     Attributes:
-        slopes: Least and largest slope in x, then in y, along z the way the rays go.
-        start_x: Least and largest origin, widened.
-        start_y: The same.
-        start_z: The foremost and the hindmost origin, counted the way the rays go, widened.
-        deepest: The largest direction along z.
-        margin: Widening of boxes.
-        axes: x, y, z, uint32.
-        away: Whether rays go down z.
-        mirror: As of a ray.
-        shear: Of the rays.
-        t_max: In t of the walk; -1 in a lane without a ray.
-        t_unit: T of the walk in units of the caller's.
+        bounds: (13,) float32, what the properties name.
+        ints: (10,) int32: axes, mirror, and the rows of a node's boxes.
+        rays: (8, 32) float32: origin along the axes, shear, t_max in t of the walk, -1 in a lane without a
+            ray, and t of the walk in units of the caller's.
     """
 
-    slopes: tuple[Array, Array, Array, Array]
-    start_x: tuple[Array, Array]
-    start_y: tuple[Array, Array]
-    start_z: tuple[Array, Array]
-    deepest: Array
-    margin: Array
-    axes: tuple[Array, Array, Array]
-    away: Array
-    mirror: Array
-    shear: Shear
-    t_max: Array
-    t_unit: Array
+    bounds: Array
+    ints: Array
+    rays: Array
+
+    @property
+    def slopes(self) -> Array:
+        """Least and largest slope in x, then in y, along z the way the rays go."""
+        return self.bounds[0:4]
+
+    @property
+    def starts(self) -> Array:
+        """Least and largest origin in x, then in y, then the foremost and the hindmost, widened."""
+        return self.bounds[4:10]
+
+    @property
+    def deepest(self) -> Array:
+        """The largest direction along z."""
+        return self.bounds[10]
+
+    @property
+    def margin(self) -> Array:
+        """Widening of boxes."""
+        return self.bounds[11]
+
+    @property
+    def sign(self) -> Array:
+        """1, or -1 where rays go down z."""
+        return self.bounds[12]
+
+    @property
+    def axes(self) -> tuple[Array, Array, Array]:
+        """x, y and z."""
+        return index(self.ints[0]), index(self.ints[1]), index(self.ints[2])
+
+    @property
+    def mirror(self) -> Array:
+        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
+        return self.ints[3]
+
+    @property
+    def rows(self) -> tuple[Array, ...]:
+        """Of boxes: low and high along x, low and high along y, near and far along z."""
+        return tuple(index(self.ints[k]) for k in range(4, 10))
+
+    @property
+    def shear(self) -> Shear:
+        """Of the rays, (32,) each."""
+        rays = self.rays
+        return Shear(self.axes, (rays[0], rays[1], rays[2]), rays[3], rays[4], rays[5])
+
+    def shear_of(self, lane: Array) -> Shear:
+        """Of one ray."""
+        ray = lax.dynamic_slice(self.rays, (jnp.uint32(0), lane), (6, 1))[:, 0]
+        return Shear(self.axes, (ray[0], ray[1], ray[2]), ray[3], ray[4], ray[5])
 
 
 class _Found(NamedTuple):
@@ -121,7 +165,7 @@ class _Found(NamedTuple):
 
 
 class _Box(NamedTuple):
-    """Sides of boxes along x, y and z, (8,) or () each."""
+    """Low and high sides of boxes along x, y and z, (8,) or () each; z is counted the way the rays go."""
 
     x: tuple[Array, Array]
     y: tuple[Array, Array]
@@ -152,47 +196,34 @@ def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Trac
 def _packet_of(row: Array) -> _Packet:
     """The packet that a row says."""
     ints = lax.bitcast_convert_type(row[12:HEAD], jnp.int32)
-    lanes = row[HEAD:].reshape(8, PACKET)
-    axes = index(ints[0]), index(ints[1]), index(ints[2] & 3)
-    shear = Shear(axes, (lanes[0], lanes[1], lanes[2]), lanes[3], lanes[4], lanes[5])
-    bounds = [row[k] for k in range(12)]
-    return _Packet(
-        (bounds[0], bounds[1], bounds[2], bounds[3]),
-        (bounds[4], bounds[5]),
-        (bounds[6], bounds[7]),
-        (bounds[8], bounds[9]),
-        bounds[10],
-        bounds[11],
-        axes,
-        (ints[2] & 4) != 0,
-        ints[3],
-        shear,
-        lanes[6],
-        lanes[7],
-    )
+    x, y, z, away = ints[0], ints[1], ints[2] & 3, ints[2] >> 2
+    near, far = z + 3 * away, z + 3 * (1 - away)
+    sign = (1 - 2 * away).astype(jnp.float32)
+    rows = jnp.stack([x, y, z, ints[3], x, x + 3, y, y + 3, near, far])
+    return _Packet(jnp.append(row[:12], sign), rows, row[HEAD:].reshape(8, PACKET))
 
 
 def _meets(packet: _Packet, box: _Box, limit: Array) -> Array:
     """Which boxes the frustum meets; where a side is not a number it says no."""
-    low = jnp.where(packet.away, -box.z[1], box.z[0]) - packet.start_z[0]
-    high = jnp.where(packet.away, -box.z[0], box.z[1]) - packet.start_z[1]
+    low, high = box.z[0] - packet.starts[4], box.z[1] - packet.starts[5]
     near = larger(low, jnp.float32(0))
 
-    def inside(sides: tuple[Array, Array], starts: tuple[Array, Array], least: Array, most: Array) -> Array:
-        # The frustum is widest to a side where its slope there makes it so.
-        below = jnp.where(least >= 0, near, high) * least
-        above = jnp.where(most >= 0, high, near) * most
+    def inside(sides: tuple[Array, Array], axis: int) -> Array:
+        least, most = packet.slopes[2 * axis], packet.slopes[2 * axis + 1]
+        below = smaller(near * least, high * least)
+        above = larger(near * most, high * most)
+        starts = packet.starts[2 * axis : 2 * axis + 2]
         return (below <= sides[1] - starts[0]) & (above >= sides[0] - starts[1])
 
-    x = inside(box.x, packet.start_x, packet.slopes[0], packet.slopes[1])
-    y = inside(box.y, packet.start_y, packet.slopes[2], packet.slopes[3])
+    x, y = inside(box.x, 0), inside(box.y, 1)
     return (high >= 0) & (low <= limit) & x & y
 
 
 def _rays_in(packet: _Packet, box: _Box, t: Array) -> Array:
     """Which rays meet one box, nearer than their closest hit: (32,) bool."""
     shear, margin = packet.shear, packet.margin
-    near, far = box.z[0] - margin - shear.origin[2], box.z[1] + margin - shear.origin[2]
+    near = (box.z[0] - margin) * packet.sign - shear.origin[2]
+    far = (box.z[1] + margin) * packet.sign - shear.origin[2]
 
     def inside(sides: tuple[Array, Array], origin: Array, slope: Array) -> Array:
         one, other = slope * near, slope * far
@@ -208,7 +239,7 @@ def _rays_in(packet: _Packet, box: _Box, t: Array) -> Array:
 def _bits(flags: Array) -> Array:
     """Flags of up to 32 lanes as bits: () uint32."""
     lanes = jnp.uint32(1) << jnp.arange(len(flags), dtype=jnp.uint32)
-    return folded(jnp.where(flags, lanes, jnp.uint32(0)), jnp.bitwise_or)
+    return jnp.sum(jnp.where(flags, lanes, jnp.uint32(0)), dtype=jnp.uint32)
 
 
 def _next_bit(bits: Array) -> tuple[Array, Array]:
@@ -225,17 +256,18 @@ class _Leaf(NamedTuple):
     rays: Array
 
 
-def _sifted(packet: _Packet, rows: LeafRows, found: _Found) -> _Leaf:
-    """The triangles whose boxes the frustum meets, and the rays that meet the box of them all."""
-    sides = [
-        (smaller(smaller(a, b), c), larger(larger(a, b), c)) for a, b, c in (rows.axes[k] for k in range(3))
-    ]
+def _sides(corners: Sequence[Array]) -> tuple[Array, Array]:
+    """The least and the largest of three coordinates."""
+    a, b, c = corners
+    return smaller(smaller(a, b), c), larger(larger(a, b), c)
+
+
+def _sifted(packet: _Packet, rows: LeafRows, around: _Box, found: _Found) -> _Leaf:
+    """The triangles whose boxes the frustum meets, and the rays that meet the leaf's box."""
+    sides = [_sides(corners) for corners in rows.axes[:2]]
+    sides.append(_sides([corner * packet.sign for corner in rows.axes[2]]))
     met = _meets(packet, _Box(*sides), found.limit)
-    around = [
-        (folded(jnp.where(met, low, FAR), smaller), folded(jnp.where(met, high, -FAR), larger))
-        for low, high in sides
-    ]
-    return _Leaf(rows, _bits(met), _bits(_rays_in(packet, _Box(*around), found.t)))
+    return _Leaf(rows, _bits(met), _bits(_rays_in(packet, around, found.t)))
 
 
 def _test_leaf(packet: _Packet, leaf: _Leaf, found: _Found, options: WalkOptions) -> _Found:
@@ -264,21 +296,21 @@ def _test_leaf(packet: _Packet, leaf: _Leaf, found: _Found, options: WalkOptions
 
 def _one_ray(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: Array) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
+    crossing = crossing_of(edges_of(*rows.axes, packet.shear_of(lane)), rows.turn)
+    old = lax.dynamic_slice(t, (lane,), (1,))[0]
+    hit = (crossing > 0) & (crossing <= old) & (rows.name != NO_NAME)
 
-    def of_ray(values: Array) -> Array:
-        return lax.dynamic_slice(values, (lane,), (1,))[0]
+    def replace() -> tuple[Array, Array]:
+        nearest = folded(jnp.where(hit, crossing, jnp.inf), smaller)
+        least = folded(jnp.where(hit & (crossing == nearest), rows.name, NO_NAME), smaller)
+        old_name = lax.dynamic_slice(name, (lane,), (1,))[0]
+        least = jnp.where((nearest < old) | (least < old_name), least, old_name)
+        return (
+            lax.dynamic_update_slice(t, nearest[None], (lane,)),
+            lax.dynamic_update_slice(name, least[None], (lane,)),
+        )
 
-    shear = packet.shear
-    x, y, z = (of_ray(values) for values in shear.origin)
-    one = Shear(shear.axes, (x, y, z), of_ray(shear.x), of_ray(shear.y), of_ray(shear.z))
-    crossing = crossing_of(edges_of(*rows.axes, one), rows.turn)
-    crossing = jnp.where((crossing > 0) & (rows.name != NO_NAME), crossing, jnp.inf)
-    nearest = folded(crossing, smaller)
-    least = folded(jnp.where(crossing == nearest, rows.name, NO_NAME), smaller)
-    old, old_name = of_ray(t), of_ray(name)
-    closer = (nearest < jnp.inf) & ((nearest < old) | ((nearest == old) & (least < old_name)))
-    t = lax.dynamic_update_slice(t, jnp.where(closer, nearest, old)[None], (lane,))
-    return t, lax.dynamic_update_slice(name, jnp.where(closer, least, old_name)[None], (lane,))
+    return lax.cond(_bits(hit) != 0, replace, lambda: (t, name))
 
 
 def _one_triangle(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: Array) -> tuple[Array, Array]:
@@ -298,6 +330,13 @@ def _one_triangle(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: 
 def _limit(packet: _Packet, t: Array) -> Array:
     """The depth along z that no ray needs to go beyond."""
     return folded(t, larger) * packet.deepest * SLACK + packet.margin
+
+
+def _box_of(scene: PacketScene, packet: _Packet, place: Place) -> _Box:
+    """The box of the leaf at hand, as its node has it."""
+    lane = place.lane ^ index(packet.mirror)
+    x0, x1, y0, y1, z0, z1 = scene.sides_in(place.node, packet.rows, lane)
+    return _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
 
 
 class _State(NamedTuple):
@@ -324,7 +363,9 @@ def _walk_packet(
         entry = jnp.stack([place.node, place.lanes])[None]
         stack = lax.dynamic_update_slice(state.stack, entry, (index(place.height), jnp.uint32(0)))
         height = jnp.where(place.lanes != 0, place.height + 1, place.height)
-        met = _meets(packet, _Box(*scene.boxes_of(place.child, packet.axes)), limit)
+        x0, x1, y0, y1, z0, z1 = scene.sides_of(place.child, packet.rows)
+        box = _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
+        met = _meets(packet, box, limit)
         lanes = jnp.sum(jnp.where(met, lane_bits, 0))
         there = next_child(scene, turn, place.child, lanes, height, stack)
         return _State(there, stack, state.turns + 1)
@@ -332,7 +373,8 @@ def _walk_packet(
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
         place = state.place
         rows = scene.leaf_rows(place.child, packet.axes)
-        found = _test_leaf(packet, _sifted(packet, rows, found), found, options)
+        leaf = _sifted(packet, rows, _box_of(scene, packet, place), found)
+        found = _test_leaf(packet, leaf, found, options)
         there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
         done = found.limit < 0
         return there._replace(child=jnp.where(done, DONE, there.child)), found
@@ -352,14 +394,14 @@ def _walk_packet(
         return state._replace(place=place), found
 
     zero = jnp.int32(0)
-    found = _Found(packet.t_max, jnp.full(PACKET, MISS), _limit(packet, packet.t_max))
-    first = jnp.where(folded(packet.t_max, larger) > 0, zero, DONE)
-    state = _State(Place(first, zero, zero, jnp.int32(1)), stack, zero)
+    found = _Found(packet.rays[6], jnp.full(PACKET, MISS), _limit(packet, packet.rays[6]))
+    first = jnp.where(folded(packet.rays[6], larger) > 0, zero, DONE)
+    state = _State(Place(first, zero, zero, jnp.int32(1), jnp.uint32(0)), stack, zero)
     state, found = lax.while_loop(
         lambda carried: (carried[0].place.child != DONE) & (carried[0].turns <= scene.node_count),
         nodes_then_leaf,
         (state, found),
     )
-    t = jnp.where(found.name < 0, jnp.float32(jnp.inf), found.t * packet.t_unit)
+    t = jnp.where(found.name < 0, jnp.float32(jnp.inf), found.t * packet.rays[7])
     name = jnp.where(state.place.child != DONE, STUCK, found.name)
     return state.stack, (t, name)

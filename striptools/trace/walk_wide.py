@@ -57,13 +57,15 @@ class WideScene(NamedTuple):
         """Test the triangles of a leaf, each lane against its own closest hit."""
         return test_block(self.blocks, index(-(child + 1)), shear, best)
 
-    def boxes_of(self, node: Array, axes: tuple[Array, Array, Array]) -> list[tuple[Array, Array]]:
-        """Low and high sides of a node's boxes along the axes."""
+    def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
+        """Sides of a node's boxes."""
+        at = index(node)
+        sides = [lax.dynamic_slice(self.nodes, (at, row, jnp.uint32(0)), (1, 1, WIDTH)) for row in rows]
+        return [side[0, 0] for side in sides]
 
-        def row(at: Array) -> Array:
-            return lax.dynamic_slice(self.nodes, (index(node), at, jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
-
-        return [(row(axis), row(axis + 3)) for axis in axes]
+    def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
+        """Sides of the box in one lane."""
+        return [lax.dynamic_slice(self.nodes, (index(node), row, lane), (1, 1, 1))[0, 0, 0] for row in rows]
 
     def leaf_rows(self, child: Array, axes: tuple[Array, Array, Array]) -> LeafRows:
         """The triangles of a leaf along the axes."""
