@@ -5,6 +5,7 @@ import numpy as np
 from striptools.measure.oracle import Oracle
 from striptools.mesh.mesh import Mesh
 from striptools.reducem.scene import Scene
+from striptools.trace.counters import Counters
 from striptools.trace.hit import Hits
 
 
@@ -66,9 +67,11 @@ class OracleTracer:
         assert scene.remap is not None
         self.place[scene.remap.face] = np.arange(scene.triangle_count, dtype=np.int32)
 
-    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, steps: bool = False) -> Hits:
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, counters: bool = False) -> Hits:
         found = self.oracle.closest_hit(origins, directions)
         triangle = np.where(found.face >= 0, self.place[found.face], -1).astype(np.int32)
-        counted = (1 + np.arange(len(origins), dtype=np.int32) % 7) if steps else None
+        zero = np.zeros(len(origins), np.int32)
+        nodes = 1 + np.arange(len(origins), dtype=np.int32) % 7
+        counted = Counters(nodes, zero, zero, zero, zero, zero) if counters else None
         t, u, v = (column.astype(np.float32) for column in (found.t, found.u, found.v))
         return Hits(t, found.face.copy(), u, v, triangle, counted)

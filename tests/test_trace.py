@@ -15,7 +15,7 @@ from striptools.errors import StriptoolsError, UsageError
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
-from striptools.trace.launch import _collect, _spread, tiles
+from striptools.trace.launch import EVERY_RAY, _collect, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
@@ -369,7 +369,7 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
     dropped = np.zeros(2000, np.uint8)
     root = (tuple(arrays.frame), *layout.root)
     count, end = ready_rays(
-        origins, directions, reach, 0, *root, False, rows, rows.view(np.int32), at, dropped
+        origins, directions, reach, EVERY_RAY, 0, *root, False, rows, rows.view(np.int32), at, dropped
     )
     assert end == 2000
     assert 1 <= count < 2000

@@ -217,7 +217,7 @@ def weigh_packed_hits(
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32, not zero where there is a hit.
-        at: (k,) int32, the rays that results are for; others are left alone.
+        at: (k,) int32, the rays that results are for, negative for none; others are left alone.
         found_t: (k,) float32, t of each.
         found: (k,) int32, 256 times its block plus its number there; negative on a miss.
         headers: (b, 8) uint32.
@@ -238,6 +238,8 @@ def weigh_packed_hits(
     corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
         r = at[k]
+        if r < 0:
+            continue
         t[r] = found_t[k]
         if found[k] < 0:
             face[r] = found[k]

@@ -73,14 +73,17 @@ def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def ready_rays(origins, directions, t_max, begin, frame, root, children, visit, rays, words, at, dropped):
+def ready_rays(
+    origins, directions, t_max, which, begin, frame, root, children, visit, rays, words, at, dropped
+):
     """Ready rays from `begin` on until the places are full or there are none left.
 
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32.
         t_max: (r,) float32.
-        begin: The first ray to take.
+        which: (m,) int32, the rays to take; (0,) for all of them.
+        begin: The first of them to take.
         frame: `trace.walk.Frame` as float32 and arrays of three: scale, reach, low, unit, margin.
         root: (>= 6, 8) float32, the boxes of the root's children, counted from low and in units; NaN in empty
             lanes; other rows are not read.
@@ -92,14 +95,17 @@ def ready_rays(origins, directions, t_max, begin, frame, root, children, visit, 
         dropped: (r,) uint8, written for the rays taken: 0 has a row, 1 missed the root, 2 is no ray.
 
     Returns:
-        The number of rows written, and the first ray not taken.
+        The number of rows written, and the first of the rays that was not taken.
     """
     scale, reach, low, unit, margin_unit = frame
     room = len(rays)
     count = 0
-    for r in range(begin, len(origins)):
+    chosen = len(which) > 0
+    every = len(which) if chosen else len(origins)
+    for place in range(begin, every):
         if count == room:
-            return count, r
+            return count, place
+        r = np.int64(which[place]) if chosen else place
 
         # Scale the ray by powers of two; refuse what is no ray.
         ox = flushed(flushed(origins[r, 0]) * scale)
@@ -181,4 +187,4 @@ def ready_rays(origins, directions, t_max, begin, frame, root, children, visit, 
         words[count, 23] = 1 if visit else 0
         at[count] = r
         count += 1
-    return count, len(origins)
+    return count, every

@@ -353,7 +353,7 @@ def weigh_hits(
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32, not zero where there is a hit.
-        at: (k,) int32, the rays that results are for; others are left alone.
+        at: (k,) int32, the rays that results are for, negative for none; others are left alone.
         found_t: (k,) float32, t of each.
         found_face: (k,) int32, the reported face; negative on a miss.
         place: (f,) int32, see `fill_leaf_blocks`.
@@ -371,6 +371,8 @@ def weigh_hits(
     corners = np.zeros((3, 3), np.float32)
     for k in range(len(at)):
         r = at[k]
+        if r < 0:
+            continue
         t[r] = found_t[k]
         face[r] = found_face[k]
         if face[r] < 0:

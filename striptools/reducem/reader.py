@@ -270,7 +270,7 @@ class _File:
             if record["flags"] & layout.HAS_ORIGIN
             else None,
         }
-        return fields[name]
+        return fields.get(name)
 
     def headers(self) -> np.ndarray:
         """The headers of blocks as they are stored, (b, 8) uint32."""

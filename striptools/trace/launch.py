@@ -3,21 +3,29 @@
 from collections import deque
 from collections.abc import Iterator
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from striptools.kernels.packets import PACKET, ready_packets
+from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import quiet_jax
-from striptools.trace.layout import Layout
-from striptools.trace.leaves import Rays, aligned_full
+from striptools.trace.layout import Layout, Rays
+from striptools.trace.leaves import aligned_full
 from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
+from striptools.trace.walk_packets import PacketScene
 
 TILES = (2**8, 2**12, 2**16)
 """Rays a CPU device takes at once: few sizes, since each is compiled. A place not filled costs next to
 nothing."""
+
+PACKET_TILES = (2**3, 2**7, 2**11)
+"""Packets that a CPU device takes at once."""
+
+EVERY_RAY = np.zeros(0, np.int32)
 
 GPU_TILES = (2**12, 2**16, 2**20)
 
@@ -44,12 +52,12 @@ def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
 
 
 @lru_cache(maxsize=64)
-def program(mesh: Mesh, options: WalkOptions) -> Any:
+def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     """The jitted function from a scene and rays to `Traced`, the rays split over the devices.
 
-    Rays are (origins, directions, t_max) where all are walked at once, else ready ones.
+    Rays are (origins, directions, t_max) where all are walked at once, else ready ones or ready packets.
     """
-    walk, arrays = (trace_rays, 3) if options.batch else (_walk_ready, 1)
+    walk, arrays = (trace_rays, 3) if options.batch else (_walk_packets if packets else _walk_ready, 1)
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
@@ -62,6 +70,10 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
 
 def _walk_ready(scene: WalkScene, ready: jax.Array, options: WalkOptions) -> Traced:
     return scene.walk_rays(ready, options)
+
+
+def _walk_packets(scene: PacketScene, ready: jax.Array, options: WalkOptions) -> Traced:
+    return scene.walk_packets(ready, options)
 
 
 def stream(
@@ -82,9 +94,15 @@ def stream(
 
 
 def stream_ready(
-    scene: WalkScene, layout: Layout, rays: Rays, dropped: np.ndarray, mesh: Mesh, options: WalkOptions
+    scene: WalkScene,
+    layout: Layout,
+    rays: Rays,
+    dropped: np.ndarray,
+    mesh: Mesh,
+    options: WalkOptions,
+    packets: bool,
 ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
-    """Make rays ready on this side, trace those that meet a child of the root, and yield them in order.
+    """Make rays ready on this side, and trace those that meet the scene: in packets, or each on its own.
 
     Args:
         scene: On the devices.
@@ -93,44 +111,114 @@ def stream_ready(
         dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
         mesh: The CPU devices.
         options: What to compile in.
+        packets: Put rays that go the same way into packets.
 
     Yields:
-        Which rays these are, int32, and their results.
+        Which rays these are, int32, -1 for none, and their results.
     """
-    compiled = program(mesh, options)
-    split = NamedSharding(mesh, _RAYS)
     count = len(rays[0])
-    room = next((size for size in TILES if size * mesh.size >= count), TILES[-1])
-    spare: list[tuple[np.ndarray, np.ndarray]] = []
-    waiting: deque[tuple[int, int, Any, tuple[np.ndarray, np.ndarray]]] = deque()
-
-    def collect() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        live, per_device, traced, buffers = waiting.popleft()
-        results = _collect(slice(0, live), per_device, traced, mesh.size)[1]
-        # Results are there, so nobody reads these rays any more.
-        spare.append(buffers)
-        return buffers[1][:live], results
-
-    seen = (tuple(layout.arrays.frame), *layout.root)
+    single = _Pipe(scene, mesh, options, TILES, (count, ROW), ())
+    if not packets:
+        yield from _send_each(single, layout, rays, EVERY_RAY, dropped)
+        yield from single.drain()
+        return
+    packed = _Pipe(scene, mesh, options, PACKET_TILES, (-(-count // PACKET), PACKET_ROW), (PACKET,))
+    alone = np.zeros(min(TILES[-1], count) + PACKET, np.int32)
+    seen = layout.seen_by_packets
     begin = 0
     while begin < count:
-        buffers = spare.pop() if spare else _ready_buffers(room * mesh.size)
-        places = (buffers[0], buffers[0].view(np.int32), buffers[1])
-        live, begin = ready_rays(*rays, begin, *seen, True, *places, dropped)
-        if live:
-            _, per_device = next(tiles(live, mesh.size, TILES))
-            with quiet_jax():
-                padded = _spread(buffers[0][:live], mesh.size, per_device)
-                waiting.append((live, per_device, compiled(scene, jax.device_put(padded, split)), buffers))
-        if len(waiting) >= READY_IN_FLIGHT:
-            yield collect()
-    while waiting:
-        yield collect()
+        buffers = packed.take()
+        places = (buffers.rows, buffers.rows.view(np.int32), buffers.at, alone, dropped)
+        live, left, begin = ready_packets(*rays, begin, *seen, *places)
+        yield from packed.send(buffers, live)
+        if left:
+            yield from _send_each(single, layout, rays, alone[:left], dropped)
+    yield from packed.drain()
+    yield from single.drain()
 
 
-def _ready_buffers(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places for ready rays, and for which ones they are."""
-    return aligned_full((count, ROW), 0.0), np.zeros(count, np.int32)
+def _send_each(
+    pipe: "_Pipe", layout: Layout, rays: Rays, which: np.ndarray, dropped: np.ndarray
+) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+    """Send rays, each on its own."""
+    seen = (tuple(layout.arrays.frame), *layout.root)
+    begin, count = 0, len(which) or len(rays[0])
+    while begin < count:
+        buffers = pipe.take()
+        places = (buffers.rows, buffers.rows.view(np.int32), buffers.at)
+        live, begin = ready_rays(*rays, which, begin, *seen, True, *places, dropped)
+        yield from pipe.send(buffers, live)
+
+
+class _Buffers(NamedTuple):
+    """Places for ready rows, and for which rays they are."""
+
+    rows: np.ndarray
+    at: np.ndarray
+
+
+class _Pipe:
+    """Rows on their way through the devices; results come in the order that rows were sent in.
+
+    Args:
+        scene: On the devices.
+        mesh: The devices.
+        options: What to compile in.
+        sizes: Rows that a device takes at once.
+        shape: Rows there are to be sent at the most, and words of a row.
+        lanes: Rays of a row: () for one, or (32,).
+    """
+
+    def __init__(
+        self,
+        scene: WalkScene,
+        mesh: Mesh,
+        options: WalkOptions,
+        sizes: tuple[int, ...],
+        shape: tuple[int, int],
+        lanes: tuple[int, ...],
+    ) -> None:
+        self._scene, self._mesh, self._sizes, self._lanes = scene, mesh, sizes, lanes
+        self._compiled = program(mesh, options, bool(lanes))
+        self._split = NamedSharding(mesh, _RAYS)
+        room = next((size for size in sizes if size * mesh.size >= shape[0]), sizes[-1])
+        self._shape = room * mesh.size, shape[1]
+        self._spare: list[_Buffers] = []
+        self._waiting: deque[tuple[int, int, Any, _Buffers]] = deque()
+
+    def take(self) -> _Buffers:
+        """Buffers that nothing reads any more."""
+        if self._spare:
+            return self._spare.pop()
+        rows = self._shape[0]
+        return _Buffers(aligned_full(self._shape, 0.0), np.zeros((rows, *self._lanes), np.int32))
+
+    def send(self, buffers: _Buffers, live: int) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Send the first `live` rows; yield what is done where enough is on its way."""
+        if live == 0:
+            self._spare.append(buffers)
+            return
+        _, per_device = next(tiles(live, self._mesh.size, self._sizes))
+        with quiet_jax():
+            padded = _spread(buffers.rows[:live], self._mesh.size, per_device)
+            traced = self._compiled(self._scene, jax.device_put(padded, self._split))
+        self._waiting.append((live, per_device, traced, buffers))
+        if len(self._waiting) >= READY_IN_FLIGHT:
+            yield self._collect()
+
+    def drain(self) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Yield all that is on its way."""
+        while self._waiting:
+            yield self._collect()
+
+    def _collect(self) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        live, per_device, traced, buffers = self._waiting.popleft()
+        results = _collect(slice(0, live), per_device, traced, self._mesh.size)[1]
+        # Results are there, so nobody reads these rays any more.
+        self._spare.append(buffers)
+        if self._lanes:
+            results = tuple(values.reshape(-1) for values in results)
+        return buffers.at[:live].reshape(-1), results
 
 
 def tiles(count: int, devices: int, sizes: tuple[int, ...]) -> Iterator[tuple[slice, int]]:

@@ -1,12 +1,43 @@
 """What a tracer needs of a scene laid out for a walk, expanded or packed."""
 
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from striptools.trace.counters import Counters
-from striptools.trace.leaves import Found, Rays
-from striptools.trace.walk import Decode
+from striptools.trace.walk import Decode, Frame
+
+Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Origins (r, 3), directions (r, 3) and t_max (r,), float32."""
+
+Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""T, face, u, v and triangle of all rays, to be filled."""
+
+PACKET_MARGIN = np.float32(2**-20)
+"""Widening of a box in units of the largest coordinate: `walk_packets`, Boxes."""
+
+MOST_TRIANGLES = 400
+"""Triangles that a packet is expected to meet, if they lie evenly, beyond which its rays go on their own."""
+
+
+class PacketView(NamedTuple):
+    """What `kernels.packets.ready_packets` must know of a scene.
+
+    Attributes:
+        frame: Scale, reach and the margin of boxes.
+        box: (6,) float32, the scaled box of the scene.
+        density: The share of the scene's area that a packet may cover.
+    """
+
+    frame: tuple[np.float32, np.float32, np.float32]
+    box: np.ndarray
+    density: np.float32
+
+
+def packet_view(frame: Frame, box: np.ndarray, triangles: int) -> PacketView:
+    """What packets are readied by in a scene of so many triangles."""
+    density = np.float32(MOST_TRIANGLES / (4 * max(1, triangles)))
+    return PacketView((frame.scale, frame.reach, PACKET_MARGIN), box, density)
 
 
 class Layout(Protocol):
@@ -30,6 +61,11 @@ class Layout(Protocol):
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
         """(>= 6, 8) float32 boxes of the root's children, NaN where is none, and (8,) int32 children."""
+        ...
+
+    @property
+    def seen_by_packets(self) -> PacketView | None:
+        """What packets are readied by; None where rays are not walked in packets."""
         ...
 
     @property

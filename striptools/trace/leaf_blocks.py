@@ -7,7 +7,7 @@ to them.
 import jax.numpy as jnp
 from jax import Array, lax
 
-from striptools.trace.triangle import Shear, crossing_of, edges_of
+from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of
 from striptools.trace.walk import NO_NAME, WIDTH, Best, replaced
 
 
@@ -20,16 +20,23 @@ def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
         shear: Of the ray.
         best: What was found so far.
     """
-
-    def corners(axis: Array) -> tuple[Array, Array, Array]:
-        rows = lax.dynamic_slice(blocks, (block, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
-        return rows[0], rows[1], rows[2]
-
-    x, y, z = (corners(axis) for axis in shear.axes)
+    x, y, z = corners_in(blocks, block, shear.axes)
     t = crossing_of(edges_of(x, y, z, shear))
     face = faces_in(blocks, block)
     closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))
     return replaced(best, closer, t, face)
+
+
+def corners_in(
+    blocks: Array, block: Array, axes: tuple[Array, Array, Array]
+) -> tuple[Corners, Corners, Corners]:
+    """Corners a, b, c along the axes, (8,) float32 each."""
+
+    def corners(axis: Array) -> Corners:
+        rows = lax.dynamic_slice(blocks, (block, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
+        return rows[0], rows[1], rows[2]
+
+    return corners(axes[0]), corners(axes[1]), corners(axes[2])
 
 
 def faces_in(blocks: Array, block: Array) -> Array:

@@ -15,6 +15,7 @@ from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
 from striptools.partition.object_split import split_objects
 from striptools.trace.box import MARGIN
 from striptools.trace.counters import Counters
+from striptools.trace.layout import Found, PacketView, Rays, packet_view
 from striptools.trace.walk import DONE, NO_NAME, Frame
 from striptools.trace.walk_wide import WideScene
 
@@ -23,12 +24,6 @@ if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
 CACHE_LINE = 64
-
-Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Origins (r, 3), directions (r, 3) and t_max (r,), float32."""
-
-Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""T, face, u, v and triangle of all rays, to be filled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +81,13 @@ class ExpandedLayout:
 @dataclass(frozen=True, eq=False)
 class WideLayout(ExpandedLayout):
     """What a tracer keeps of an expanded scene under eight-wide nodes."""
+
+    @property
+    def seen_by_packets(self) -> PacketView | None:
+        """What packets are readied by."""
+        boxes = self.arrays.nodes[0]
+        box = np.concatenate([np.nanmin(boxes[:3], axis=1), np.nanmax(boxes[3:6], axis=1)])
+        return packet_view(self.arrays.frame, box, len(self.leaves.triangle_of))
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,8 @@ import numpy as np
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
 from striptools.trace.counters import Counters
-from striptools.trace.leaves import Found, Rays, aligned_zeros, reach_of, scale_of, size_class
+from striptools.trace.layout import Found, PacketView, Rays
+from striptools.trace.leaves import aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
 from striptools.trace.walk_packed import MARGIN, PackedScene
 
@@ -56,6 +57,11 @@ class PackedLayout:
         if top:
             child = np.where(leaf, top + (word[1] & 0xFFFFFF) + rank, child)
         return np.where(empty, np.float32(np.nan), boxes), child.astype(np.int32)
+
+    @property
+    def seen_by_packets(self) -> PacketView | None:
+        """Packets are not walked here."""
+        return None
 
     @property
     def missed(self) -> Counters:

@@ -43,6 +43,10 @@ class SingleLayout(ExpandedLayout):
         return boxes, np.array([0, *[DONE] * (WIDTH - 1)], np.int32)
 
     @property
+    def seen_by_packets(self) -> None:
+        """Rays go one at a time."""
+
+    @property
     def missed(self) -> Counters:
         """A ray that misses the root's box tests that."""
         return Counters(0, 0, 1, 0, 0, 0)

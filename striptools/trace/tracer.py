@@ -13,8 +13,8 @@ from striptools.trace.counters import KINDS, counters_of
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.hit import Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
-from striptools.trace.layout import Layout
-from striptools.trace.leaves import Rays, lay_out, lay_out_rebuilt
+from striptools.trace.layout import Layout, Rays
+from striptools.trace.leaves import lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import MISS, STUCK, WalkOptions
@@ -157,6 +157,7 @@ class Tracer:
         *,
         t_max: np.ndarray | float | None = None,
         counters: bool = False,
+        packets: bool = True,
     ) -> Hits:
         """Find what each ray hits first.
 
@@ -165,6 +166,8 @@ class Tracer:
             directions: (r, 3).
             t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
             counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
+            packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side:
+                those of a camera or towards a light. Hits are the same.
 
         Raises:
             UsageError: The arrays are not of these shapes, or not numbers.
@@ -177,7 +180,7 @@ class Tracer:
         dropped = np.zeros(count, np.uint8)
         counted = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
-        for at, traced in self._stream(rays, dropped, any_hit=False, count=counters):
+        for at, traced in self._stream(rays, dropped, any_hit=False, count=counters, packets=packets):
             if counters:
                 counted[at] = traced[2]
             _check_ended(traced[1])
@@ -188,28 +191,36 @@ class Tracer:
         return Hits(t, face, u, v, triangle, counters_of(counted) if counters else None)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, count: bool
+        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, count: bool, packets: bool
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
         if self._empty:
             return
         options = self._options(any_hit=any_hit, count=count)
         if not options.batch:
-            yield from stream_ready(self._scene, self._layout, rays, dropped, self._mesh, options)
+            given = (self._scene, self._layout, rays, dropped, self._mesh, options)
+            in_packets = packets and not count and self._layout.seen_by_packets is not None
+            yield from stream_ready(*given, in_packets)
             return
         for part, traced in stream(self._scene, rays, self._mesh, options):
             yield np.arange(part.start, part.stop, dtype=np.int32), traced
 
     def any_hit(
-        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
+        self,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        *,
+        t_max: np.ndarray | float | None = None,
+        packets: bool = True,
     ) -> Bool[np.ndarray, " r"]:
         """Say of each ray whether it hits anything; arguments and errors as for `closest_hit`."""
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, any_hit=True, count=False):
+        for at, traced in self._stream(rays, dropped, any_hit=True, count=False, packets=packets):
             _check_ended(traced[1])
-            hit[at] = traced[1] >= 0
+            there = at >= 0
+            hit[at[there]] = traced[1][there] >= 0
         return hit
 
     def _options(self, *, any_hit: bool, count: bool) -> WalkOptions:

@@ -227,7 +227,7 @@ class ReadyRay(NamedTuple):
     @property
     def start(self) -> "Place":
         """Where the walk starts."""
-        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
+        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1), jnp.uint32(0))
 
     @property
     def visited(self) -> Array:
@@ -235,13 +235,26 @@ class ReadyRay(NamedTuple):
         return self.ints[6]
 
 
+class Mirrored(Protocol):
+    """A ray, or rays that go the same way."""
+
+    @property
+    def mirror(self) -> Array:
+        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
+        ...
+
+
 class Place(NamedTuple):
-    """Where a ray is: the child to visit next, and the lanes left of the node it came from."""
+    """Where a ray is: the child to visit next, the lanes left of the node it came from, and the child's.
+
+    The lane is the place in the order of visits.
+    """
 
     child: Array
     node: Array
     lanes: Array
     height: Array
+    lane: Array
 
 
 def trace_rays(
@@ -332,8 +345,8 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     return floats, jnp.stack([*axes, mirror, start, zero, zero])
 
 
-def _next_child(
-    scene: WalkScene, ray: ReadyRay, node: Array, lanes: Array, height: Array, stack: Array
+def next_child(
+    scene: WalkScene, ray: Mirrored, node: Array, lanes: Array, height: Array, stack: Array
 ) -> Place:
     """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
     empty = lanes == 0
@@ -343,7 +356,7 @@ def _next_child(
     lanes = jnp.where(empty, top[1], lanes)
     order = 31 - lax.clz(lanes)
     child = scene.child_of(node, index(order ^ ray.mirror))
-    return Place(child, node, lanes ^ (jnp.int32(1) << order), height)
+    return Place(child, node, lanes ^ (jnp.int32(1) << order), height, index(order))
 
 
 def _visit_node(
@@ -355,7 +368,7 @@ def _visit_node(
     height = jnp.where(place.lanes != 0, place.height + 1, place.height)
     met = scene.lanes_met(place.child, ray.slab, limit)
     lanes = jnp.sum(jnp.where(met, ray.lane_bits, 0))
-    there = _next_child(scene, ray, place.child, lanes, height, stack)
+    there = next_child(scene, ray, place.child, lanes, height, stack)
     # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
     active = place.child >= 0
     return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
@@ -457,7 +470,7 @@ class _Walk:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
         best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
-        there = _next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
+        there = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
         return there, best

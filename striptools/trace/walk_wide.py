@@ -7,10 +7,11 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.leaf_blocks import test_block, triangles_in
+from striptools.trace.leaf_blocks import corners_in, faces_in, test_block, triangles_in
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import WIDTH, Best, Frame, Traced, WalkOptions, walk_rays
+from striptools.trace.walk_packets import LeafRows, walk_packets
 
 
 class WideScene(NamedTuple):
@@ -55,6 +56,25 @@ class WideScene(NamedTuple):
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
         return test_block(self.blocks, index(-(child + 1)), shear, best)
+
+    def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
+        """Sides of a node's boxes."""
+        at = index(node)
+        sides = [lax.dynamic_slice(self.nodes, (at, row, jnp.uint32(0)), (1, 1, WIDTH)) for row in rows]
+        return [side[0, 0] for side in sides]
+
+    def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
+        """Sides of the box in one lane."""
+        return [lax.dynamic_slice(self.nodes, (index(node), row, lane), (1, 1, 1))[0, 0, 0] for row in rows]
+
+    def leaf_rows(self, child: Array, axes: tuple[Array, Array, Array]) -> LeafRows:
+        """The triangles of a leaf along the axes."""
+        leaf = index(-(child + 1))
+        return LeafRows(corners_in(self.blocks, leaf, axes), faces_in(self.blocks, leaf), None)
+
+    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+        """Walk packets made ready."""
+        return walk_packets(self, ready, options)
 
     def triangles_of(self, child: Array) -> Array:
         """() int32: how many triangles a leaf has."""
