@@ -357,7 +357,7 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # Where the time goes (camera rays from the picture's middle): the expanded walk takes 255 of 348 ns, 54 % of
 # it in the node loop; this one 437 of 564, 39 %. So nodes cost 32 ns more, leaves 150, weights of hits 30.
 #
-# Ratios of speed to what stands here, on a machine with much other work. Lost: ten vertices of a strip decoded
+# Ratios of speed to what stands here, on a busy machine. Lost: ten vertices of a strip decoded
 # once, the far corners gathered from them, 0.92 (2100 instructions fewer, but through memory), with a
 # concatenation 0.57; both rays' leaves at once under vmap 0.82, one after the other without a cond 0.85; near
 # and far planes chosen by the direction's signs in the loop 0.92; words selected for each coordinate 1.0; the
