@@ -14,17 +14,16 @@ Differences:
 4. Lanes hold triangles, not faces: the remap is read where two hits have the same t, and nowhere else.
 
 **Boxes.** With L the grid's low and c its cell on an axis, scaled, a plane K = origin + (q << shift) is at
-L + cK exactly. Of a ray at o with (rounded) inverse direction v the distance to it, with margin m, is
-computed as
+L + cK exactly, and K, below 2**24, is an exact float32. Of a ray at o with (rounded) inverse direction v the
+distance to it, with margin m, is computed as
 
-    q * (cv << shift) + (origin * cv - ((o + m) - L) * v),   cv exact, c and << shift powers of two.
+    K * cv - ((o + m) - L) * v,   cv exact, c a power of two.
 
 In units of position, with u = 2^-24 and M the largest of |o| and the scene's coordinates, rounding o + m and
-taking L away and multiplying by v moves it by at most u (M + 2 * 2M); the product and the sum with origin by
-u (2M + 2M), half of it where they are fused; the product with q by u 2M, none of it where fused. The last sum
-is relative to the distance itself, which `box.FAR_FACTOR` allows for. That is 11 uM, and the triangle test
-needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that would be denormal counts
-as zero: its planes move by less than 2^-100.
+taking L away and multiplying by v moves it by at most u (M + 2 * 2M); the product with K by u 2M, none of it
+where fused. The last sum is relative to the distance itself, which `box.FAR_FACTOR` allows for. That is 7 uM,
+and the triangle test needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that
+would be denormal counts as zero: its planes move by less than 2^-100.
 """
 
 from itertools import pairwise
@@ -387,14 +386,12 @@ def _used_bytes(low: Array, high: Array) -> Array:
 #
 # Where the time goes (camera rays from the picture's middle): the expanded walk takes 255 of 348 ns, 54 % of
 # it in the node loop; this one 437 of 564, 39 %. So nodes cost 32 ns more, leaves 150, weights of hits 30.
-# Both loops run at about five instructions a cycle, a third of them XLA's own moves.
 #
-# Tried and lost: words selected for each coordinate instead of each vertex 1.0; the new closest hits marked
-# by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along 0.92. Ratios of speed
-# to what stands here: ten vertices of a strip decoded once, the far corners gathered from them, 0.92 (2100
-# instructions fewer, but through memory), with a concatenation 0.57; both rays' leaves at once under vmap
-# 0.82, one after the other without a cond 0.85; near and far planes chosen by the direction's signs in the
-# loop 0.92; closest hits by the least integer, any lane by a sum of integers 1.0; one count of bits for nodes
-# and blocks in the place of two 1.0; four words of a record read in the place of sixteen 1.0; hits weighed in
-# two passes of 64 1.0. Three words a vertex in the place of the four that the widest blocks need would give
-# 1.02.
+# Ratios of speed to what stands here, on a busy machine. Lost: ten vertices of a strip decoded
+# once, the far corners gathered from them, 0.92 (2100 instructions fewer, but through memory), with a
+# concatenation 0.57; both rays' leaves at once under vmap 0.82, one after the other without a cond 0.85; near
+# and far planes chosen by the direction's signs in the loop 0.92; words selected for each coordinate 1.0; the
+# closest hits marked by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along
+# 0.92. No gain: the closest hit by the least integer, any lane by a sum of integers, one count of bits in the
+# place of two, fewer words of a record read, hits weighed in two passes of 64. Three words a vertex in the
+# place of the four that the widest blocks need would give 1.02.
