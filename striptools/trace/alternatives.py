@@ -16,11 +16,18 @@ def lay_out_alternative(scene: "Scene", hierarchy: StoredHierarchy, threads: int
     """Lay a scene out for the walk of its own hierarchy."""
     match hierarchy:
         case Slbvh():
-            from striptools.trace.slbvh import lay_out_slbvh as lay_out
+            from striptools.trace.slbvh import lay_out_slbvh
+
+            return lay_out_slbvh(scene, hierarchy, threads)
         case KdTree():
-            from striptools.trace.kdtree import lay_out_kdtree as lay_out
+            from striptools.trace.kdtree import lay_out_kdtree
+
+            return lay_out_kdtree(scene, hierarchy, threads)
         case LooseBvh():
-            from striptools.trace.binary import lay_out_loose as lay_out
+            from striptools.trace.binary import lay_out_loose
+
+            return lay_out_loose(scene, hierarchy, threads)
         case _:
-            from striptools.trace.presorted import lay_out_presorted as lay_out
-    return lay_out(scene, hierarchy, threads)
+            from striptools.trace.presorted import lay_out_presorted
+
+            return lay_out_presorted(scene, hierarchy, threads)

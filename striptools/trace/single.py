@@ -77,6 +77,22 @@ def lay_out_leaves(
     return Leaves(held.blocks, first), held, frame
 
 
+def triangles_of_objects(starts: Counts, objects: Counts) -> tuple[Counts, Counts]:
+    """The triangles of objects that are ranges in file order, object after object.
+
+    Args:
+        starts: (p+1,) int32, the first triangle of each object, then their number.
+        objects: (k,) int32, which ones.
+
+    Returns:
+        (m,) int32, the triangles, and (k+1,) int32, where those of each object begin, then m.
+    """
+    sizes = np.diff(starts)[objects]
+    begin = np.zeros(len(objects) + 1, np.int32)
+    np.cumsum(sizes, out=begin[1:])
+    return np.arange(begin[-1], dtype=np.int32) + np.repeat(starts[objects] - begin[:-1], sizes), begin
+
+
 def padded(values: np.ndarray, filling: Any = 0) -> np.ndarray:
     """A copy from a cache line on, filled up to a size class, so that scenes of like size share a program."""
     room = aligned_zeros((size_class(len(values) + 1), *values.shape[1:]), values.dtype.type)
