@@ -196,7 +196,7 @@ def _unless_identity(order: Counts) -> Counts | None:
 #
 # Where triangles are of about one size (dragon, icub) extent says nothing that the centre does not, and cells
 # full of equals cost 1 %. Cells three binary levels finer, so loosened to four times their side: 0.949,
-# 1.065, 1.118, 1.087, 1.212, 1.344 in the order above; no worse than an LBVH anywhere, no better on the whole.
+# 1.065, 1.118, 1.087, 1.212, 1.344 in the order above; never worse than an LBVH, no better on the whole.
 #
 # Objects of one cell halved by place, without the finer bits of their centres: 1.172 on the powerplant in the
 # order of a SAH tree and 7.1 at random, where it is 0.958 with them; whole octree levels 1.40 and 14. A pipe
