@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rays import aimed_rays
 from scenes import scene_of, scenes, small_scene
 from strategies import clean_meshes, cube, grid, line, sphere, stack
+from test_trace import far_fetched
 
 from striptools.errors import LimitError, StriptoolsError, UnreadableSceneError, UsageError
 from striptools.hierarchies import kdtree as module
@@ -395,9 +396,14 @@ def traced(scene, tree, origins, directions, **given):
     return tracer.closest_hit(origins, directions, counters=True, **given)
 
 
-def assert_same_hits(hits, expected):
+def assert_same_hits(hits, expected, where=slice(None)):
     for name in ("t", "face", "u", "v", "triangle"):
-        assert np.array_equal(getattr(hits, name), getattr(expected, name)), name
+        assert np.array_equal(getattr(hits, name)[where], getattr(expected, name)[where]), name
+
+
+def sure_of(scene, origins, directions, *hits):
+    """Rays whose hits are not noise of triangles smaller than the rounding of their distance."""
+    return ~np.any([far_fetched(scene, each, origins, directions) for each in hits], axis=0)
 
 
 @settings(max_examples=12)
@@ -414,7 +420,7 @@ def test_hits_are_those_of_the_default_walk(drawn, seed, over, metric, mailbox):
     tree, _, _ = tree_of(scene, metric, over, constants=KdCosts(intersection=2.0))
     expected = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
     hits = traced(scene, replace(tree, mailbox=mailbox), origins, directions)
-    assert_same_hits(hits, expected)
+    assert_same_hits(hits, expected, sure_of(scene, origins, directions, hits, expected))
 
 
 @pytest.mark.parametrize("over", ["triangles", "strips"])

@@ -127,7 +127,9 @@ def build_kdtree(
     costs = kernels.Costs(
         float(constants.traversal), float(constants.intersection), float(constants.empty_bonus), corrected
     )
-    root = kernels.root_cell(np.ascontiguousarray(boxes, np.float32), float(min(ROOM * len(boxes), MOST_ROOM)))
+    root = kernels.root_cell(
+        np.ascontiguousarray(boxes, np.float32), float(min(ROOM * len(boxes), MOST_ROOM))
+    )
     deepest = min(DEEPEST, constants.deepest(len(boxes)))
     tree = _grow(root, deepest, costs, corners, threads)
     return KdTree(options.objects, *tree, low=root.bounds[:3].copy(), high=root.bounds[3:].copy())
