@@ -297,6 +297,6 @@ def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int
 # to 9 % more tests than the corrected one on the maple, 23 to 26 % more on the chandelier, at about the same
 # steps, and none more on the bunny: that much is the correction's own.
 #
-# Time is another matter. A step takes 15 to 20 ns here, most of it waiting for memory, and there are 7 to 16
+# Time is another matter. A step takes 15 to 20 ns here, most of it waiting for memory, and there are 4 to 17
 # steps to a test of a triangle (Hunt: 3): processor time changes by -2 to +3 % over triangles (bunny,
 # chandelier, 256 x 256). Over strips, whose test is dear, up to 20 % was saved (bunny; a busy machine).
