@@ -376,10 +376,10 @@ def _finish(axes: "Axes") -> None:
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
 
 
-# Notes. Rays a second over those of the whole SAH BVH in the same walk, primary/secondary, by plain levels, and
-# of the default walk over eight-wide nodes; megabytes of the whole SAH BVH. One study a mesh, 256 x 256 primary
-# rays, 5 runs, one thread, by process time, as the machine was busy. Plain nodes of 5 to 16 levels take 1 kB to
-# 1.6-2.1 MB on all of them, never above the limit.
+# Notes. Rays a second over those of the whole SAH BVH in the same walk, primary/secondary, by plain levels,
+# and of the default walk over eight-wide nodes; megabytes of the whole SAH BVH. One study a mesh, 256 x 256
+# primary rays, 5 runs, one thread, by process time, as the machine was busy. Plain nodes of 5 to 16 levels
+# take 1 kB to 1.6-2.1 MB on all of them, never above the limit.
 #
 #     mesh                0          5          10         12         14         16         wide       MB
 #     bunny               0.43/0.47  0.55/0.50  0.68/0.64  0.78/0.74  0.90/0.88  1.00/0.98  1.87/2.27  2.4
@@ -389,10 +389,11 @@ def _finish(axes: "Axes") -> None:
 #     dem_jacksboro       0.32/0.27  0.48/0.40  0.74/0.65  0.85/0.78  0.97/0.95  1.10/1.09  1.79/2.20  8.8
 #     dragon              0.49/0.49  0.64/0.54  0.80/0.70  0.85/0.77  0.95/0.88  1.04/1.05  1.81/2.23  33.4
 #
-# Sixteen levels trace as fast as the whole BVH or faster, with a fifteenth of its nodes (dragon): its lower
-# nodes cost cache lines of their own, while presorted ones are read with the triangles.
+# Sixteen levels trace about as fast as the whole BVH (0.98 to 1.13 of it), on the dragon with a sixteenth of
+# its nodes and a third more tests: presumably because plain nodes cost cache lines of their own, and
+# presorted ones are read with the triangles.
 #
 # The bandwidth order reads 0.62-0.67 of the direct test's coordinates without levels and 0.65-0.71 under ten,
-# and is 1.21-1.40 and 1.06-1.15 times as fast here: it tests 1 to 13 triangles a ray instead of 41 to 193, and
-# a watertight test costs more than a slab. Under the whole BVH it reads 0.91-1.00 and is 0.96-1.01 times as
-# fast. The paper tested directly, since on graphics cards of its day the order brought no gain.
+# and is 1.21-1.40 and 1.06-1.15 times as fast here: without levels it tests 1 to 13 triangles a ray instead
+# of 41 to 193, and a watertight test costs more than a slab. Under the whole BVH it reads 0.91-1.00 and is
+# 0.96-1.01 times as fast. The paper tested directly: its graphics cards gained nothing by the order.
