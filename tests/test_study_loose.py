@@ -1,6 +1,7 @@
-"""The study of the loose octree: a row a build and kind of objects, costs by definition, counts of the walks."""
+"""The study of the loose octree: a row a build and kind of objects, costs by definition, counts of walks."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def cost_slowly(hierarchy, starts, boxes):
             halves(first, middle)
             halves(middle, end)
 
-    for first, end in zip(starts[:-1], starts[1:], strict=True):
+    for first, end in pairwise(starts.tolist()):
         if end - first > 1:
             middle = first + (end - first + 1) // 2
             halves(first, middle)

@@ -187,15 +187,16 @@ def _unless_identity(order: Counts) -> Counts | None:
     return None if np.array_equal(order, np.arange(len(order))) else order
 
 
-# Notes. Expected cost of one triangle a leaf over that of a full binned SAH tree: by centres alone (LBVH), with
-# levels that are whole ones of the octree, and with binary ones as here; triangles in the order of a SAH tree.
+# Notes. Expected cost of one triangle a leaf over that of a full binned SAH tree: by centres alone (LBVH),
+# with levels that are whole ones of the octree, and with binary ones as here; triangles in the order of a SAH
+# tree.
 #
 #     powerplant 1.212, 1.019, 0.929    cocoa_temple 1.392, 1.027, 1.038    kicad_acepack 1.192, 1.156, 1.126
 #     fzk_haus   1.195, 1.119, 1.098    icub         1.224, 1.255, 1.238    chandelier    1.344, 1.355, 1.353
 #
 # Where triangles are of about one size (dragon, icub) extent says nothing that the centre does not, and cells
-# full of equals cost 1 %. Cells three binary levels finer, loose by three times their size: 0.949, 1.065,
-# 1.118, 1.087, 1.212, 1.344 in the order above; no worse than an LBVH anywhere, no better on the whole.
+# full of equals cost 1 %. Cells three binary levels finer, so loosened to four times their side: 0.949,
+# 1.065, 1.118, 1.087, 1.212, 1.344 in the order above; never worse than an LBVH, no better on the whole.
 #
 # Objects of one cell halved by place, without the finer bits of their centres: 1.172 on the powerplant in the
 # order of a SAH tree and 7.1 at random, where it is 0.958 with them; whole octree levels 1.40 and 14. A pipe

@@ -45,6 +45,7 @@ from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.trace import Tracer
 from striptools.trace.counters import Counters
+from striptools.trace.single import triangles_of_objects
 from striptools.types import Boxes, Counts
 
 __all__ = ["BUILDS", "KINDS", "LooseRow", "LooseStudy", "RayCost", "study", "tables"]
@@ -206,12 +207,9 @@ def _cost_of(hierarchy: LooseBvh, starts: Counts, triangle_boxes: Boxes) -> floa
     # The first child's nodes are twice its leaves less one.
     left = (nodes[inner, 6] - inner) // 2
     over_objects = StripHierarchy(nodes[inner, :6].view(np.float32), left.astype(np.uint32))
-    counts = np.diff(starts)
-    if order is None:
-        order = np.arange(len(counts), dtype=np.int32)
-    place = np.append(0, np.cumsum(counts[order])).astype(np.int32)
-    triangle = np.arange(place[-1]) + np.repeat(starts[order] - place[:-1], counts[order])
-    tree = expand_hierarchy(over_objects, place, np.ascontiguousarray(triangle_boxes[triangle]))
+    objects = np.arange(len(starts) - 1, dtype=np.int32) if order is None else order
+    triangles, place = triangles_of_objects(starts, objects)
+    tree = expand_hierarchy(over_objects, place, np.ascontiguousarray(triangle_boxes[triangles]))
     return expected_cost(tree.boxes, tree.size)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from striptools.hierarchies.binary import binary_depth
 from striptools.hierarchies.loose_octree import LooseBvh
 from striptools.hierarchies.options import OverName
-from striptools.trace.single import SingleLayout, lay_out_leaves, padded
+from striptools.trace.single import SingleLayout, lay_out_leaves, padded, triangles_of_objects
 from striptools.trace.walk_binary import BinaryScene
 from striptools.types import Counts
 
@@ -29,23 +29,15 @@ def lay_out_binary(scene: "Scene", nodes: np.ndarray, order: Counts | None, over
         order: (p,) int32, the objects as leaves name them; None where they lie in that order.
         over: What the objects are.
     """
-    triangles, place = _triangles_in_order(scene.objects(over), order)
+    starts = scene.objects(over)
+    objects = np.arange(len(starts) - 1, dtype=np.int32) if order is None else order
+    triangles, place = triangles_of_objects(starts, objects)
     is_leaf = nodes[:, 7] > 0
     first = nodes[is_leaf, 6].astype(np.int64)
     leaves, held, frame = lay_out_leaves(scene, triangles, np.append(place[first], place[-1]))
     rows = _rows(nodes, is_leaf, held.scale)
     root = nodes[0, :6].view(np.float32) * held.scale
     return SingleLayout(BinaryScene(padded(rows), leaves, frame), held, binary_depth(nodes), root)
-
-
-def _triangles_in_order(starts: Counts, order: Counts | None) -> tuple[Counts, Counts]:
-    """The triangles of objects in an order, and (p+1,) int32 where those of each begin, then their number."""
-    if order is None:
-        return np.arange(starts[-1], dtype=np.int32), starts
-    counts = np.diff(starts)[order]
-    place = np.append(0, np.cumsum(counts)).astype(np.int32)
-    within = np.arange(place[-1], dtype=np.int32) - np.repeat(place[:-1], counts)
-    return np.repeat(starts[:-1][order], counts) + within, place
 
 
 def _rows(nodes: np.ndarray, is_leaf: np.ndarray, scale: np.float32) -> np.ndarray:
