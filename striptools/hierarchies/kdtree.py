@@ -16,10 +16,13 @@ Differences and decisions:
    margin larger than they are.
 4. Events are words of 64 bits; a clipped part is cut from the triangle afresh, in float64, and rounded
    outward within the part it is cut from, so that no error builds up.
-5. The cells of a large tree's top are split one after another by any thread that is free, what is below them
+5. A tree has room for a number of leaves and references in proportion to its objects, and a cell shares its
+   with the cells below by their objects; one without room for two is a leaf. Soups of large triangles would
+   else have thousands of references an object.
+6. The cells of a large tree's top are split one after another by any thread that is free, what is below them
    grows as a whole; the tree does not depend on threads.
 
-Cost: O(n log n) time; about 150 bytes a reference while it is built.
+Cost: O(n log n) time; some 400 bytes an object while it is built (power plant).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -43,7 +46,11 @@ Corners = Float32[np.ndarray, "n 3 3"]
 MAILBOX = 8
 """References that a ray remembers where nothing else is asked for."""
 
-MOST_REFERENCES = 2**28
+ROOM = 128
+"""The most leaves and references of a tree, together, for each object."""
+
+MOST_OBJECTS = 2**28
+MOST_ROOM = 2**29
 """So that four times a place fits a word."""
 
 SUBTREE = 2**15
@@ -106,21 +113,25 @@ def build_kdtree(
 
     Raises:
         UsageError: No object, boxes that are not finite or inverted, or corners of other objects.
-        LimitError: More than MOST_REFERENCES objects, or references to them.
+        LimitError: More than MOST_OBJECTS objects.
     """
     if constants is None:
         constants = KdCosts(intersection=KD_STRIP_COST) if options.objects == "strips" else KdCosts()
     check_boxes(boxes)
     corners = _checked_corners(boxes, corners)
-    _check_most(len(boxes))
+    if len(boxes) > MOST_OBJECTS:
+        raise LimitError(
+            f"{len(boxes)} objects", where="kd-tree", remedy="build it over strips, or another hierarchy"
+        )
     corrected = options.metric == "corrected"
     costs = kernels.Costs(
         float(constants.traversal), float(constants.intersection), float(constants.empty_bonus), corrected
     )
-    root = kernels.root_cell(np.ascontiguousarray(boxes, np.float32))
+    root = kernels.root_cell(
+        np.ascontiguousarray(boxes, np.float32), float(min(ROOM * len(boxes), MOST_ROOM))
+    )
     deepest = min(DEEPEST, constants.deepest(len(boxes)))
     tree = _grow(root, deepest, costs, corners, threads)
-    _check_most(len(tree.references))
     return KdTree(options.objects, *tree, low=root.bounds[:3].copy(), high=root.bounds[3:].copy())
 
 
@@ -160,46 +171,48 @@ _FLAWS = (
 
 def _grow(root: kernels.Cell, deepest: int, costs: kernels.Costs, corners: np.ndarray, threads: int) -> _Tree:
     """Split large cells here, generation by generation, grow the rest in a pool, and put all together."""
+    generations: list[list[kernels.Plane | None]] = []
+    jobs = []
+    cells = [root]
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        generations: list[list[kernels.Plane]] = []
-        jobs = []
-        cells = [root]
         while cells:
             depth = len(generations)
-            splits = [depth < deepest and len(cell.objects) > SUBTREE for cell in cells]
-            planes = list(pool.map(_plane_of, cells, splits, [costs] * len(cells)))
-            small = [cell for cell, plane in zip(cells, planes, strict=True) if plane.axis < 0]
+            given = [(cell, depth < deepest, costs, corners) for cell in cells]
+            splits = list(pool.map(_split_large, *zip(*given, strict=True)))
+            small = [cell for cell, split in zip(cells, splits, strict=True) if split is None]
             jobs.append([pool.submit(_subtree, cell, depth, deepest, costs, corners) for cell in small])
-            large = [(cell, plane) for cell, plane in zip(cells, planes, strict=True) if plane.axis >= 0]
-            halves = pool.map(lambda each: kernels.split_cell(each[0], each[1], corners), large)
-            cells = [cell for pair in halves for cell in pair]
-            generations.append(planes)
-        grown = [[job.result() for job in generation] for generation in jobs]
-    return _joined(generations, grown)
+            generations.append([None if split is None else split[0] for split in splits])
+            cells = [cell for split in splits if split is not None for cell in split[1:]]
+        return _joined(generations, [[job.result() for job in generation] for generation in jobs])
 
 
-def _plane_of(cell: kernels.Cell, splits: bool, costs: kernels.Costs) -> kernels.Plane:
-    """Where a cell is split: nowhere unless it may be."""
-    nowhere = kernels.Plane(-1, np.float32(0), False, 0.0)
-    return kernels.best_plane(cell, costs) if splits else nowhere
+def _split_large(
+    cell: kernels.Cell, may_be_split: bool, costs: kernels.Costs, corners: np.ndarray
+) -> tuple[kernels.Plane, kernels.Cell, kernels.Cell] | None:
+    """The plane that a large cell is split by and the cells on its sides; None where it is not split here."""
+    if not may_be_split or len(cell.objects) <= SUBTREE:
+        return None
+    plane = kernels.best_plane(cell, costs)
+    if plane.axis < 0:
+        return None
+    below, above, fits = kernels.split_cell(cell, plane, corners)
+    return (plane, below, above) if fits else None
 
 
 def _subtree(
     cell: kernels.Cell, depth: int, deepest: int, costs: kernels.Costs, corners: np.ndarray
 ) -> _Tree:
-    nodes, references = kernels.grow_tree(cell, depth, deepest, MOST_REFERENCES, costs, corners)
-    _check_most(len(references))
-    return _Tree(nodes, references)
+    return _Tree(*kernels.grow_tree(cell, depth, deepest, costs, corners))
 
 
-def _joined(generations: list[list[kernels.Plane]], grown: list[list[_Tree]]) -> _Tree:
+def _joined(generations: list[list[kernels.Plane | None]], grown: list[list[_Tree]]) -> _Tree:
     """The whole tree, from the deepest generation of cells up: two belong to each split in the one above."""
     below: list[_Tree] = []
     for planes, subtrees in zip(reversed(generations), reversed(grown), strict=True):
         pairs = iter(below)
         leaves = iter(subtrees)
         below = [
-            next(leaves) if plane.axis < 0 else _split_tree(plane, next(pairs), next(pairs))
+            next(leaves) if plane is None else _split_tree(plane, next(pairs), next(pairs))
             for plane in planes
         ]
     return below[0]
@@ -235,15 +248,6 @@ def _checked_corners(boxes: Boxes, corners: Corners | None) -> np.ndarray:
             f"corners have shape {corners.shape}", where="kd-tree", remedy=f"give ({len(boxes)}, 3, 3)"
         )
     return np.ascontiguousarray(corners, np.float32)
-
-
-def _check_most(count: int) -> None:
-    if count > MOST_REFERENCES:
-        raise LimitError(
-            f"more than {MOST_REFERENCES} references",
-            where="kd-tree",
-            remedy="build it over strips, or another hierarchy",
-        )
 
 
 def _expect_shapes(tree: KdTree) -> None:

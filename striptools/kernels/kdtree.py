@@ -13,9 +13,10 @@ import numpy as np
 from striptools.kernels.boxes import half_area
 from striptools.kernels.compiled import helper, inlined, kernel, maker
 
-Cell = namedtuple("Cell", "bounds parts objects events begin_y begin_z")
+Cell = namedtuple("Cell", "bounds parts objects events begin_y begin_z room")
 """bounds (6,) float32, low then high; parts (k, 6) float32; objects (k,) uint32, rising; events (e,) uint64,
-those along x, from begin_y on along y, from begin_z on along z."""
+those along x, from begin_y on along y, from begin_z on along z; room float64, the most leaves and references
+of the tree below, together, at least k + 1."""
 
 Plane = namedtuple("Plane", "axis position planar_below cost")
 """Where to split: axis -1 is nowhere; objects that lie in the plane go below it or above."""
@@ -99,8 +100,8 @@ def merge_words(one, other, out):
 
 
 @kernel
-def root_cell(boxes):
-    """The cell that holds all objects, and their sorted events."""
+def root_cell(boxes, room):
+    """The cell that holds all objects, and their sorted events; its tree has `room`, see `Cell`."""
     count = boxes.shape[0]
     bounds = np.empty(6, np.float32)
     for axis in range(3):
@@ -119,16 +120,16 @@ def root_cell(boxes):
 
     # Write the events of each axis after those of the one before, and sort them.
     events = np.empty(6 * count, np.uint64)
-    room = np.empty(2 * count, np.uint64)
+    spare = np.empty(2 * count, np.uint64)
     begin = np.zeros(4, np.int64)
     for axis in range(3):
         section = events[begin[axis] :]
         found = 0
         for k in range(count):
             found = put_events(section, found, parts[k, axis], parts[k, 3 + axis], k)
-        sort_words(section, found, room)
+        sort_words(section, found, spare)
         begin[axis + 1] = begin[axis] + found
-    return Cell(bounds, parts, objects, events[: begin[3]].copy(), begin[1], begin[2])
+    return Cell(bounds, parts, objects, events[: begin[3]].copy(), begin[1], begin[2], room)
 
 
 @inlined
@@ -283,7 +284,7 @@ def shares_of(cell, plane, place, straddles):
 
 
 @maker
-def child_cell(cell, plane, side, count, place, straddles, corners, room):
+def child_cell(cell, plane, side, count, share, place, straddles, corners, room):
     """The cell on one side of a plane."""
     bounds = cell.bounds.copy()
     bounds[plane.axis + (3 if side == BELOW else 0)] = plane.position
@@ -336,12 +337,12 @@ def child_cell(cell, plane, side, count, place, straddles, corners, room):
             begin_y = total
         if axis == 1:
             begin_z = total
-    return Cell(bounds, parts, objects, events[:total].copy(), begin_y, begin_z)
+    return Cell(bounds, parts, objects, events[:total].copy(), begin_y, begin_z, share)
 
 
 @kernel
 def split_cell(cell, plane, corners):
-    """The cells below and above a plane.
+    """The cells below and above a plane, and whether there is room for both; they share it by their objects.
 
     Args:
         cell: The cell.
@@ -353,34 +354,38 @@ def split_cell(cell, plane, corners):
     straddles = np.empty(count, np.bool_)
     room = np.empty((2, 12, 3), np.float64)
     below, above = shares_of(cell, plane, place, straddles)
+    asked = below + above + 2
+    if cell.room < asked:
+        return cell, cell, False
+    one = cell.room * (below + 1) / asked
+    other = cell.room * (above + 1) / asked
     return (
-        child_cell(cell, plane, BELOW, below, place[BELOW], straddles, corners, room),
-        child_cell(cell, plane, ABOVE, above, place[ABOVE], straddles, corners, room),
+        child_cell(cell, plane, BELOW, below, one, place[BELOW], straddles, corners, room),
+        child_cell(cell, plane, ABOVE, above, other, place[ABOVE], straddles, corners, room),
+        True,
     )
 
 
 @kernel
-def grow_tree(cell, depth, deepest, most, costs, corners):
+def grow_tree(cell, depth, deepest, costs, corners):
     """The tree under a cell.
 
     Args:
         cell: The cell.
         depth: Of the cell.
         deepest: Cells at this depth are leaves.
-        most: References beyond which to give up.
         costs: `Costs`.
         corners: See `split_cell`.
 
     Returns:
-        Nodes (m, 2) uint32 and references (k,) uint32 as in `hierarchies.kdtree.KdTree`; more than `most`
-        references where it gave up.
+        Nodes (m, 2) uint32 and references (k,) uint32 as in `hierarchies.kdtree.KdTree`.
     """
     nodes = np.empty((1024, 2), np.uint32)
     references = np.empty(1024, np.uint32)
     count = 0
     used = 0
     waiting = [(cell, depth, -1)]
-    while len(waiting) > 0 and used <= most:
+    while len(waiting) > 0:
         cell, depth, parent = waiting.pop()
         if count == nodes.shape[0]:
             more = np.empty((2 * count, 2), np.uint32)
@@ -389,12 +394,14 @@ def grow_tree(cell, depth, deepest, most, costs, corners):
         if parent >= 0:
             nodes[parent, 1] |= np.uint32(4 * count)
 
-        # Split where it pays.
+        # Split where it pays and there is room.
         plane = best_plane(cell, costs)
+        below, above, fits = cell, cell, False
         if plane.axis >= 0 and depth < deepest:
+            below, above, fits = split_cell(cell, plane, corners)
+        if fits:
             nodes[count, 0] = np.float32(plane.position).view(np.uint32)
             nodes[count, 1] = plane.axis
-            below, above = split_cell(cell, plane, corners)
             waiting.append((above, depth + 1, count))
             waiting.append((below, depth + 1, -1))
             count += 1
