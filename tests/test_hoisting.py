@@ -23,17 +23,24 @@ def loops_outside_hoisted_calls(text):
     return outside
 
 
-def compiled_text(any_hit, steps=False):
-    tracer = Tracer(small_scene(), device="cpu")
-    options = tracer._options(any_hit=any_hit, steps=steps)
+def compiled_text(resident="expanded", **asked):
+    tracer = Tracer(small_scene(), device="cpu", resident=resident)
+    options = tracer._options(**asked)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
     lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
     return lowered.compile().as_text()
 
 
-@pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
-def test_walks_are_hoisted(any_hit, steps):
-    text = compiled_text(any_hit, steps)
+GATHERING = [
+    {"gather": gather, "most": most, "resident": resident}
+    for gather, most in (("all", 1), ("all", 16), ("all", 128), ("count", 1), ("windings", 1))
+    for resident in ("expanded", "compressed")
+]
+
+
+@pytest.mark.parametrize("asked", [{}, {"any_hit": True}, {"steps": True}, *GATHERING])
+def test_walks_are_hoisted(asked):
+    text = compiled_text(**asked)
     assert 'xla_cpu_small_call="true"' in text
     assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
     assert loops_outside_hoisted_calls(text) == []

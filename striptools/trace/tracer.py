@@ -5,17 +5,19 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
-from striptools.errors import StriptoolsError, UsageError
+from striptools.errors import UsageError
 from striptools.trace.device import DeviceKind, trace_devices
-from striptools.trace.hit import Hits
+from striptools.trace.gathering import all_hits, check_ended, counts
+from striptools.trace.hit import AllHits, Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Layout
 from striptools.trace.leaves import Rays, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
-from striptools.trace.walk import MISS, STUCK, WalkOptions
+from striptools.trace.walk import MISS, WalkOptions
+from striptools.trace.walk_gather import GatherKind
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
@@ -154,10 +156,10 @@ class Tracer:
         dropped = np.zeros(count, np.uint8)
         counted = np.zeros(count if steps else 0, np.int32)
         found = (t, face, u, v, triangle)
-        for at, traced in self._stream(rays, dropped, any_hit=False, steps=steps):
+        for at, traced in self._stream(rays, dropped, self._options(steps=steps)):
             if steps:
                 counted[at] = traced[2]
-            _check_ended(traced[1])
+            check_ended(traced[1])
             # On this side, while the devices are at the next rays.
             self._layout.weigh(rays, at, traced, found)
         if steps:
@@ -165,12 +167,11 @@ class Tracer:
         return Hits(t, face, u, v, triangle, counted if steps else None)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, steps: bool
+        self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
-        if self._empty:
+        if options is None:
             return
-        options = self._options(any_hit=any_hit, steps=steps)
         if not options.batch:
             yield from stream_ready(self._scene, self._layout, rays, dropped, self._mesh, options)
             return
@@ -184,15 +185,57 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, any_hit=True, steps=False):
-            _check_ended(traced[1])
+        for at, traced in self._stream(rays, dropped, self._options(any_hit=True)):
+            check_ended(traced[1])
             hit[at] = traced[1] >= 0
         return hit
 
-    def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:
+    def all_hits(
+        self, origins: np.ndarray, directions: np.ndarray, *, k: int, t_max: np.ndarray | float | None = None
+    ) -> AllHits:
+        """Find the first k things that each ray hits, by t and then by face.
+
+        The first is the closest hit. Programs are compiled for powers of two.
+
+        Args:
+            origins: (r, 3) in the model's unit.
+            directions: (r, 3).
+            k: 1 to 1024.
+            t_max: As for `closest_hit`.
+
+        Raises:
+            UsageError: As for `closest_hit`, or k is out of range.
+            StriptoolsError: As for `closest_hit`.
+        """
+        layout = None if self._empty else self._layout
+        return all_hits(self._gather, layout, checked_rays(origins, directions, t_max), k)
+
+    def count_hits(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
+    ) -> Int32[np.ndarray, " r"]:
+        """Count all faces that each ray hits, every one of those that share an edge or a corner it hits.
+
+        Arguments and errors are those of `closest_hit`.
+        """
+        return counts(self._gather, checked_rays(origins, directions, t_max), "count")
+
+    def _gather(
+        self, rays: Rays, kind: GatherKind, most: int
+    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        dropped = np.zeros(len(rays[0]), np.uint8)
+        return self._stream(rays, dropped, self._options(gather=kind, most=most))
+
+    def _options(
+        self, *, any_hit: bool = False, steps: bool = False, gather: GatherKind | None = None, most: int = 0
+    ) -> WalkOptions | None:
+        """What to compile in; None where there is nothing to trace."""
+        if self._empty:
+            return None
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode)
+        return WalkOptions(
+            side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode, gather, most
+        )
 
 
 def _check_kinds(hierarchy: str, resident: str) -> None:
@@ -250,11 +293,3 @@ def _as_float32(values: Any, name: str) -> Float32[np.ndarray, "..."]:
         raise UsageError(
             f"not an array of numbers: {error}", where=name, remedy="give float32 values"
         ) from error
-
-
-def _check_ended(face: np.ndarray) -> None:
-    stuck = int((face == STUCK).sum())
-    if stuck:
-        raise StriptoolsError(
-            f"the walk of {stuck} rays did not end", where="scene hierarchy", remedy="convert the model again"
-        )

@@ -37,8 +37,8 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
 from striptools.trace.numerics import folded, index
-from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
-from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
+from striptools.trace.triangle import Corners, Shear, pick
+from striptools.trace.walk import DONE, Best, Decode, Frame, Leaf, WalkOptions, replaced
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
@@ -118,23 +118,26 @@ class PackedScene(NamedTuple):
         # The bottom of a stack has a lane that no node has.
         return jnp.where(_at_bottom(node, self.node_count), DONE, child)
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
-        """Decode the triangles of a run and test them, each lane against its own closest hit."""
-        assert options.decode is not None
+    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The triangles of a run, decoded, their corners along these axes."""
+        assert decode is not None
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = lax.optimization_barrier(self._run_of(child))
         header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
         first = header[0] + (run & 0xFF)
         lane = jnp.arange(LANES, dtype=jnp.uint32)
-        corners = self._corners(header, run, options.decode.flips)
-        x, y, z = self._positions(header, corners, options.decode)
+        corners = self._corners(header, run, decode.flips)
+        x, y, z = self._positions(header, corners, decode)
         turn = _first_corner(x, y, z)
-        ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
-        t = crossing_of(edges_of(ax, ay, az, shear), turn)
-        t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
-        triangle = (first + lane).astype(jnp.int32)
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, turn, lane <= (run >> 8 & 7), (first + lane).astype(jnp.int32))
+
+    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
+        """Decode the triangles of a run and test them, each lane against its own closest hit."""
+        leaf = self.leaf_of(shear.axes, child, options.decode)
+        t = leaf.crossings(shear)
         found = _any((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, triangle, options.any_hit), lambda: best)
+        return lax.cond(found, lambda: self._merged(best, t, leaf.name, options.any_hit), lambda: best)
 
     def _merged(self, best: Best, t: Array, triangle: Array, any_hit: bool) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""

@@ -7,8 +7,8 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Shear, crossing_of, edges_of
-from striptools.trace.walk import WIDTH, Best, Frame, WalkOptions, replaced
+from striptools.trace.triangle import Shear
+from striptools.trace.walk import WIDTH, Best, Decode, Frame, Leaf, WalkOptions, replaced
 
 
 class WideScene(NamedTuple):
@@ -50,20 +50,24 @@ class WideScene(NamedTuple):
         bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
         return lax.bitcast_convert_type(bits, jnp.int32)
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
-        """Test the triangles of a leaf, each lane against its own closest hit."""
+    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The triangles of a leaf, their corners along these axes."""
         leaf = index(-(child + 1))
 
         def corners(axis: Array) -> tuple[Array, Array, Array]:
             rows = lax.dynamic_slice(self.blocks, (leaf, axis * 3, jnp.uint32(0)), (1, 3, WIDTH))[0]
             return rows[0], rows[1], rows[2]
 
-        x, y, z = (corners(axis) for axis in shear.axes)
-        t = crossing_of(edges_of(x, y, z, shear))
+        x, y, z = (corners(axis) for axis in axes)
         bits = lax.dynamic_slice(self.blocks, (leaf, jnp.uint32(9), jnp.uint32(0)), (1, 1, WIDTH))[0, 0]
-        face = lax.bitcast_convert_type(bits, jnp.int32)
-        closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))
-        return replaced(best, closer, t, face)
+        return Leaf(x, y, z, None, None, lax.bitcast_convert_type(bits, jnp.int32))
+
+    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
+        """Test the triangles of a leaf, each lane against its own closest hit."""
+        leaf = self.leaf_of(shear.axes, child, options.decode)
+        t = leaf.crossings(shear)
+        closer = (t > 0) & ((t < best.t) | ((t == best.t) & (leaf.name < best.name)))
+        return replaced(best, closer, t, leaf.name)
 
 
 # Notes
