@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.trace.containment import ContainKind, rays_from, winding_numbers
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, Hits
@@ -219,6 +220,51 @@ class Tracer:
         """
         return counts(self._gather, checked_rays(origins, directions, t_max), "count")
 
+    def contains(self, points: np.ndarray, *, method: ContainKind = "parity") -> Bool[np.ndarray, " r"]:
+        """Say of each point whether it is inside the mesh, which has to be closed.
+
+        By parity, a ray from the point leaves the mesh an odd number of times: fast; edges and corners in its
+        way are counted right, and it does not matter how faces are wound. By winding, the generalised winding
+        number is beyond a half: slow, for each point takes each triangle, but it bears holes; faces must be
+        wound one way. Of points on the surface, and of meshes with holes by parity, nothing is promised. A
+        point that is not finite is outside.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions.
+            method: "parity" or "winding".
+
+        Raises:
+            UsageError: The points are not of this shape, there is no such method, or it is winding and the
+                scene is kept compressed.
+            StriptoolsError: As for `closest_hit`.
+        """
+        if method == "winding":
+            return np.abs(self.winding_numbers(points)) > 0.5
+        if method != "parity":
+            raise UsageError(f"no such method: {method!r}", remedy="use parity or winding")
+        return counts(self._gather, rays_from(checked_points(points)), "windings") % 2 == 1
+
+    def winding_numbers(self, points: np.ndarray) -> Float32[np.ndarray, " r"]:
+        """The generalised winding number of the mesh at each point, 0 at points that are not finite.
+
+        1 inside and 0 outside of a closed mesh whose faces are wound counter-clockwise from outside; in
+        between where there are holes. Each point takes each triangle.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions.
+
+        Raises:
+            UsageError: The points are not of this shape, or the scene is kept compressed.
+        """
+        checked = checked_points(points)
+        if self._empty:
+            return np.zeros(len(checked), np.float32)
+        if self._resident == "compressed":
+            raise UsageError(
+                "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
+            )
+        return winding_numbers(self._layout.arrays, checked)
+
     def _gather(
         self, rays: Rays, kind: GatherKind, most: int
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
@@ -233,9 +279,7 @@ class Tracer:
             return None
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        return WalkOptions(
-            side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode, gather, most
-        )
+        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode, gather, most)
 
 
 def _check_kinds(hierarchy: str, resident: str) -> None:
@@ -279,6 +323,20 @@ def checked_rays(
     if reach.shape not in ((), (len(start),)):
         raise UsageError(f"of shape {reach.shape}", where="t_max", remedy=f"give one number or {len(start)}")
     return start, way, np.ascontiguousarray(np.broadcast_to(reach, len(start)))
+
+
+def checked_points(points: np.ndarray) -> Float32[np.ndarray, "r 3"]:
+    """Points as float32, (r, 3).
+
+    Raises:
+        UsageError: They are not.
+    """
+    given = _as_float32(points, "points")
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise UsageError(
+            f"of shape {given.shape}", where="points", remedy="give an array of shape (points, 3)"
+        )
+    return given
 
 
 def _as_float32(values: Any, name: str) -> Float32[np.ndarray, "..."]:

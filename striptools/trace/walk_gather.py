@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from striptools.trace.numerics import folded
+from striptools.trace.numerics import folded, index
 from striptools.trace.triangle import Shear, edges_of, windings_of
 
 if TYPE_CHECKING:
@@ -24,20 +24,30 @@ GatherKind = Literal["all", "count", "windings"]
 class Gathered(NamedTuple):
     """What a ray has met: `nearest` is the distance beyond which nothing matters any more.
 
-    T, face and name, (most,), are sorted; places left have t_max and names below zero. Count is () int32.
+    Kept is (most, 3) int32, the bits of t, face and name, sorted; places left have t_max and -1. Count is ()
+    int32.
     """
 
     nearest: Array
-    t: Array
-    face: Array
-    name: Array
+    kept: Array
     count: Array
+
+    @property
+    def t(self) -> Array:
+        """(most,) float32."""
+        return _float(self.kept[:, 0])
+
+    @property
+    def name(self) -> Array:
+        """(most,) int32, what the scene calls the triangles hit; negative where there is none."""
+        return self.kept[:, 2]
 
 
 def nothing_gathered(t_max: Array, most: int) -> Gathered:
     """What a ray has met before it starts; t_max comes before any hit at t_max."""
     none = jnp.full(most, -1, jnp.int32)
-    return Gathered(t_max, jnp.full(most, t_max), none, none, jnp.int32(0))
+    kept = jnp.stack([jnp.broadcast_to(_bits(t_max), most), none, none], axis=1)
+    return Gathered(t_max, kept, jnp.int32(0))
 
 
 def gather_leaf(
@@ -46,37 +56,78 @@ def gather_leaf(
     """Add the triangles of a leaf."""
     leaf = scene.leaf_of(shear.axes, child, options.decode)
     if options.gather == "windings":
-        return so_far._replace(count=so_far.count + _windings(leaf, shear))
+        return _counted(so_far, _windings(leaf, shear))
     t = leaf.crossings(shear)
     if options.gather == "count":
-        met = (t > 0) & (t < t_max)
-        return so_far._replace(count=so_far.count + _total(met))
+        return _counted(so_far, jnp.where((t > 0) & (t < t_max), jnp.int32(1), jnp.int32(0)))
     met = (t > 0) & (t <= so_far.nearest)
-    return lax.cond(_total(met) > 0, lambda: _inserted(scene, leaf, t, met, so_far), lambda: so_far)
+    return lax.cond(_bits_of(met) != 0, lambda: _inserted(scene, leaf, t, met, so_far), lambda: so_far)
 
 
-def _total(flags: Array) -> Array:
-    return folded(jnp.where(flags, jnp.int32(1), jnp.int32(0)), jnp.add)
+def _counted(so_far: Gathered, numbers: Array) -> Gathered:
+    """Add numbers, under a cond of their own, or XLA makes a packed leaf anew for each term of the sum."""
+    some = _bits_of(numbers != 0) != 0
+    return lax.cond(
+        some, lambda: so_far._replace(count=so_far.count + folded(numbers, jnp.add)), lambda: so_far
+    )
+
+
+def _bits_of(flags: Array) -> Array:
+    """Flags as the bits of a number."""
+    lanes = jnp.arange(len(flags), dtype=jnp.int32)
+    return folded(jnp.where(flags, jnp.int32(1) << lanes, jnp.int32(0)), jnp.bitwise_or)
 
 
 def _windings(leaf: "Leaf", shear: Shear) -> Array:
     windings = windings_of(edges_of(leaf.x, leaf.y, leaf.z, shear), shear)
-    if leaf.filled is not None:
-        windings = jnp.where(leaf.filled, windings, 0)
-    return folded(windings, jnp.add)
+    return windings if leaf.filled is None else jnp.where(leaf.filled, windings, 0)
 
 
 def _inserted(scene: "WalkScene", leaf: "Leaf", t: Array, met: Array, so_far: Gathered) -> Gathered:
     """Put the hits of a leaf in their places, one after the other; what falls out at the end is lost."""
-    face = scene.faces_of(leaf.name)
-    t = jnp.where(met, t, jnp.float32(jnp.inf))
-    kept = so_far.t, so_far.face, so_far.name
-    for lane in range(len(t)):
-        new = t[lane], face[lane], leaf.name[lane]
-        stays = (kept[0] < new[0]) | ((kept[0] == new[0]) & (kept[1] < new[1]))
-        after = jnp.concatenate([jnp.ones(1, jnp.bool_), stays[:-1]])
-        kept = tuple(
-            jnp.where(stays, old, jnp.where(after, value, jnp.concatenate([old[:1], old[:-1]])))
-            for old, value in zip(kept, new, strict=True)
-        )
-    return Gathered(kept[0][-1], *kept, so_far.count)
+    new = jnp.stack([_bits(t), scene.faces_of(leaf.name), leaf.name], axis=1)
+
+    def insert_next(carried: tuple[Array, Array]) -> tuple[Array, Array]:
+        bits, kept = carried
+        lane = 31 - lax.clz(bits)
+        return bits ^ (jnp.int32(1) << lane), _insert(kept, _row(new, lane))
+
+    kept = lax.while_loop(lambda carried: carried[0] != 0, insert_next, (_bits_of(met), so_far.kept))[1]
+    return so_far._replace(nearest=_float(kept[-1, 0]), kept=kept)
+
+
+def _insert(kept: Array, new: Array) -> Array:
+    """Move what comes after a hit one place on, from the end, and put it there."""
+    place = jnp.int32(len(kept) - 1)
+    last = kept[-1]
+
+    def comes_after(row: Array) -> Array:
+        return (row[0] > new[0]) | ((row[0] == new[0]) & (row[1] > new[1]))
+
+    def move(carried: tuple[Array, Array]) -> tuple[Array, Array]:
+        place, kept = carried
+        return place - 1, _with_row(kept, place, _row(kept, place - 1))
+
+    def goes_on(carried: tuple[Array, Array]) -> Array:
+        place, kept = carried
+        return (place > 0) & comes_after(_row(kept, jnp.where(place > 0, place - 1, 0)))
+
+    place, kept = lax.while_loop(goes_on, move, (place, kept))
+    return _with_row(kept, place, jnp.where((place == len(kept) - 1) & ~comes_after(last), last, new))
+
+
+def _row(rows: Array, at: Array) -> Array:
+    return lax.dynamic_slice(rows, (index(at), jnp.uint32(0)), (1, 3))[0]
+
+
+def _with_row(rows: Array, at: Array, row: Array) -> Array:
+    return lax.dynamic_update_slice(rows, row[None], (index(at), jnp.uint32(0)))
+
+
+def _bits(t: Array) -> Array:
+    """Of a t that is not negative: ordered as t is."""
+    return lax.bitcast_convert_type(t, jnp.int32)
+
+
+def _float(bits: Array) -> Array:
+    return lax.bitcast_convert_type(bits, jnp.float32)
