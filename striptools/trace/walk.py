@@ -85,7 +85,7 @@ class Leaf(NamedTuple):
     """The triangles of a leaf, a lane each.
 
     Attributes:
-        x, y, z: Corners a, b, c along three axes, (8,) float32 each; NaN in empty lanes where `filled` is None.
+        x, y, z: Corners a, b, c along three axes, (8,) float32 each; NaN in empty lanes if `filled` is None.
         turn: (8,) which corner is the first in the canonical order; None where that is corner a.
         filled: (8,) bool, which lanes hold a triangle; None where empty ones hold NaN.
         name: (8,) int32, what the scene calls the triangles.
