@@ -7,10 +7,10 @@ has an even number of faces, and points farther from the surface than the roundi
 mesh has holes, the answer is that of the ray's direction and worth nothing behind them.
 
 **By winding.** The generalised winding number (Jacobson, Kavan & Sorkine-Hornung, "Robust Inside-Outside
-Segmentation Using Generalized Winding Numbers", SIGGRAPH 2013): the solid angles of all faces over 4 pi, after
-Van Oosterom & Strackee, "The Solid Angle of a Plane Triangle", IEEE Trans. Biomed. Eng. 30(2), 1983. It is a
-whole number for closed meshes wound one way, and fades gently where there are holes: inside is more than a
-half. Cost: every triangle for every point. Sums are float32, pairwise: errors of 1e-5 or so.
+Segmentation Using Generalized Winding Numbers", SIGGRAPH 2013): the solid angles of all faces over 4 pi,
+after Van Oosterom & Strackee, "The Solid Angle of a Plane Triangle", IEEE Trans. Biomed. Eng. 30(2), 1983. It
+is a whole number for closed meshes wound one way, and fades gently where there are holes: inside is more than
+a half. Cost: every triangle for every point. Sums are float32, pairwise: errors of 1e-5 or so.
 """
 
 from functools import lru_cache
@@ -42,7 +42,7 @@ def rays_from(points: np.ndarray) -> Rays:
 def winding_numbers(scene: WideScene, points: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, " r"]:
     """The generalised winding number at each point, by the solid angles of all triangles."""
     numbers = np.zeros(len(points), np.float32)
-    finite = np.isfinite(points).all(axis=1)
+    finite = np.all(np.isfinite(points), axis=1)
     for first in range(0, len(points), POINTS_AT_ONCE):
         part = points[first : first + POINTS_AT_ONCE]
         padded = np.zeros((POINTS_AT_ONCE, 3), np.float32)

@@ -57,3 +57,24 @@ class AllHits:
     v: Float32[np.ndarray, "r k"]
     triangle: Int32[np.ndarray, "r k"]
     count: Int32[np.ndarray, " r"]
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestPoints:
+    """The point of the surface that is closest to each of r points.
+
+    Attributes:
+        point: (r, 3) float32, in the frame of the scene's positions; NaN where there is none.
+        distance: (r,) float32; inf where there is none; negative inside, where signs were asked for.
+        face: (r,) int32, as in `Hits`; -1 where there is none.
+        u: (r,) float32, the weight of the face's second corner, as in `Hits`.
+        v: (r,) float32, the weight of its third corner.
+        triangle: (r,) int32, as in `Hits`; -1 where there is none.
+    """
+
+    point: Float32[np.ndarray, "r 3"]
+    distance: Float32[np.ndarray, " r"]
+    face: Int32[np.ndarray, " r"]
+    u: Float32[np.ndarray, " r"]
+    v: Float32[np.ndarray, " r"]
+    triangle: Int32[np.ndarray, " r"]

@@ -28,8 +28,11 @@ rays."""
 READY_IN_FLIGHT = 2
 """The same of CPU devices: more only push each other's rays out of the cache."""
 
-_RAYS = PartitionSpec("device")
-_EVERYWHERE = PartitionSpec()
+RAYS = PartitionSpec("device")
+"""One share of the rays a device."""
+
+EVERYWHERE = PartitionSpec()
+"""The whole on each device."""
 
 
 def device_mesh(devices: list[jax.Device]) -> Mesh:
@@ -40,7 +43,7 @@ def device_mesh(devices: list[jax.Device]) -> Mesh:
 def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
     """Put a whole scene on each device."""
     with quiet_jax():
-        return jax.device_put(scene, NamedSharding(mesh, _EVERYWHERE))
+        return jax.device_put(scene, NamedSharding(mesh, EVERYWHERE))
 
 
 @lru_cache(maxsize=64)
@@ -53,8 +56,8 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
-        in_specs=(_EVERYWHERE, *(_RAYS,) * arrays),
-        out_specs=_RAYS,
+        in_specs=(EVERYWHERE, *(RAYS,) * arrays),
+        out_specs=RAYS,
         check_vma=False,
     )
     return jax.jit(split)
@@ -64,10 +67,16 @@ def stream(
     scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
     """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
-    compiled = program(mesh, options)
-    split = NamedSharding(mesh, _RAYS)
+    yield from stream_through(program(mesh, options), scene, rays, mesh, GPU_TILES)
+
+
+def stream_through(
+    compiled: Any, scene: WalkScene, rays: tuple[np.ndarray, ...], mesh: Mesh, sizes: tuple[int, ...]
+) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
+    """The same by any program of a scene and arrays; places left over hold zeros."""
+    split = NamedSharding(mesh, RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
-    for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES):
+    for part, per_device in tiles(len(rays[0]), mesh.size, sizes):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
             waiting.append((part, per_device, compiled(scene, *jax.device_put(padded, split))))
@@ -94,7 +103,7 @@ def stream_ready(
         Which rays these are, int32, and their results.
     """
     compiled = program(mesh, options)
-    split = NamedSharding(mesh, _RAYS)
+    split = NamedSharding(mesh, RAYS)
     count = len(rays[0])
     room = next((size for size in TILES if size * mesh.size >= count), TILES[-1])
     spare: list[tuple[np.ndarray, np.ndarray]] = []

@@ -60,6 +60,10 @@ class Layout:
         arrays = (self.arrays.nodes, self.arrays.blocks, self.place, self.triangle_of)
         return sum(a.nbytes for a in arrays)
 
+    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles of what the walk names, and how the corners of its leaves are turned."""
+        return names, self.triangle_of[names], self.place[names] & 3
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays

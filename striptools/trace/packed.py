@@ -66,6 +66,12 @@ class PackedLayout:
         held = (arrays.nodes, arrays.headers, arrays.words, arrays.first_run, arrays.runs, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
 
+    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces of triangles, the triangles, and how the corners of the file's are turned."""
+        faces = self.arrays.faces[names] if self.arrays.has_faces else names
+        turns = self.rotations[names] if len(self.rotations) else np.zeros(len(names), np.uint8)
+        return faces, names, turns
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays

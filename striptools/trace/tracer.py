@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
 from striptools.trace.device import DeviceKind, trace_devices
 from striptools.trace.gathering import all_hits, check_ended, counts
-from striptools.trace.hit import AllHits, Hits
+from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Layout
 from striptools.trace.leaves import Rays, lay_out, lay_out_rebuilt
@@ -19,6 +20,7 @@ from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import MISS, WalkOptions
 from striptools.trace.walk_gather import GatherKind
+from striptools.trace.walk_points import PointOptions
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
@@ -219,6 +221,33 @@ class Tracer:
         Arguments and errors are those of `closest_hit`.
         """
         return counts(self._gather, checked_rays(origins, directions, t_max), "count")
+
+    def closest_point(self, points: np.ndarray, *, signed: bool = False) -> ClosestPoints:
+        """Find the point of the surface closest to each point.
+
+        Where on its triangle it is, and how far, is computed in float64. Which triangle it is was decided in
+        float32: none is closer by more than 2**-20 of the largest coordinate of point and scene. Of equal
+        ones it is the least face.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times as
+                far as the scene reaches, has none.
+            signed: Make distances negative inside, by `contains` by parity: for closed meshes.
+
+        Raises:
+            UsageError: The points are not of this shape.
+            StriptoolsError: As for `closest_hit`.
+        """
+        checked = checked_points(points)
+        if self._empty:
+            found = nothing_closest(len(checked))
+        else:
+            options = PointOptions(self._stack_size, self._on_gpu, self._layout.decode)
+            found = closest_points(self._scene, self._layout, checked, self._mesh, options)
+        if signed:
+            inside = self.contains(checked)
+            found.distance[inside] *= -1
+        return found
 
     def contains(self, points: np.ndarray, *, method: ContainKind = "parity") -> Bool[np.ndarray, " r"]:
         """Say of each point whether it is inside the mesh, which has to be closed.

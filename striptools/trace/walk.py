@@ -130,6 +130,10 @@ class WalkScene(Protocol):
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         ...
 
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, lo xyz and hi xyz, scaled; NaN in empty lanes."""
+        ...
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane: a node, or a negative number other than `DONE` that names a leaf."""
         ...
@@ -188,13 +192,13 @@ class Decode(NamedTuple):
 class Traced(NamedTuple):
     """One entry a ray; what was not asked for has none. `name` is what the scene calls the triangle hit.
 
-    Where all hits are gathered t and name are (r, most), by t and then by face; else count tells.
+    Where all hits are gathered t and name are (r, most), by t and then by face; else `counted` tells.
     """
 
     t: Array
     name: Array
     steps: Array
-    count: Array
+    counted: Array
 
 
 class _Ray(NamedTuple):
@@ -392,7 +396,7 @@ class _Walked(NamedTuple):
     t: Array
     name: Array
     steps: Array
-    count: Array
+    counted: Array
 
 
 class _State(NamedTuple):
@@ -514,7 +518,7 @@ def _result(
 ) -> tuple[Array, Array, Array]:
     """What is reported of a ray: t in the caller's units, the name of the triangle, what was counted."""
     if isinstance(best, Gathered):
-        t, name, count = best.t, best.name, best.count
+        t, name, count = best.t, best.name, best.counted
     else:
         t, name, count = best.nearest, _closest_name(scene, best, any_hit), jnp.zeros(0, jnp.int32)
     t = jnp.where(name < 0, jnp.float32(jnp.inf), t * ray.t_unit)

@@ -24,13 +24,13 @@ GatherKind = Literal["all", "count", "windings"]
 class Gathered(NamedTuple):
     """What a ray has met: `nearest` is the distance beyond which nothing matters any more.
 
-    Kept is (most, 3) int32, the bits of t, face and name, sorted; places left have t_max and -1. Count is ()
-    int32.
+    Kept is (most, 3) int32, the bits of t, face and name, sorted; places left have t_max and -1.
+    Counted is () int32.
     """
 
     nearest: Array
     kept: Array
-    count: Array
+    counted: Array
 
     @property
     def t(self) -> Array:
@@ -68,7 +68,7 @@ def _counted(so_far: Gathered, numbers: Array) -> Gathered:
     """Add numbers, under a cond of their own, or XLA makes a packed leaf anew for each term of the sum."""
     some = _bits_of(numbers != 0) != 0
     return lax.cond(
-        some, lambda: so_far._replace(count=so_far.count + folded(numbers, jnp.add)), lambda: so_far
+        some, lambda: so_far._replace(counted=so_far.counted + folded(numbers, jnp.add)), lambda: so_far
     )
 
 

@@ -104,6 +104,17 @@ class PackedScene(NamedTuple):
             high.append(planes[axis + 3] * step + (start - slab.high[axis]))
         return passes(low, high, limit) & (planes[0] <= planes[3])
 
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
+        at = index(node)
+        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
+        origins = jnp.stack([head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF])
+        shifts = jnp.stack([head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28])
+        cells = origins[:, None] + (planes.reshape(2, 3, LANES).astype(jnp.uint32) << shifts[:, None])
+        boxes = _number(cells) * self.frame.unit[:, None] + self.frame.low[:, None]
+        return jnp.where(planes[0] <= planes[3], boxes.reshape(6, LANES), jnp.float32(jnp.nan))
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
         head = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]

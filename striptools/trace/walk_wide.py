@@ -42,8 +42,12 @@ class WideScene(NamedTuple):
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
+        return lanes_met(self.boxes_of(node), slab, limit)
+
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, scaled; NaN in empty lanes."""
         at = (index(node), jnp.uint32(0), jnp.uint32(0))
-        return lanes_met(lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0], slab, limit)
+        return lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0]
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; leaf q is -(q + 1)."""
