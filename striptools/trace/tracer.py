@@ -4,13 +4,14 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
-from striptools.trace.device import DeviceKind, trace_devices
+from striptools.trace.device import DeviceKind, quiet_jax, trace_devices
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
@@ -230,8 +231,8 @@ class Tracer:
         ones it is the least face.
 
         Args:
-            points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times as
-                far as the scene reaches, has none.
+            points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times
+                as far as the scene reaches, has none.
             signed: Make distances negative inside, by `contains` by parity: for closed meshes.
 
         Raises:
@@ -293,6 +294,18 @@ class Tracer:
                 "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
             )
         return winding_numbers(self._layout.arrays, checked)
+
+    def program_parts(self) -> tuple[Any, WalkOptions]:
+        """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
+
+        Raises:
+            UsageError: There is nothing to trace.
+        """
+        options = self._options()
+        if options is None:
+            raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
+        with quiet_jax():
+            return jax.device_put(self._layout.arrays, self.devices[0]), options
 
     def _gather(
         self, rays: Rays, kind: GatherKind, most: int
