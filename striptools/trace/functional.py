@@ -1,4 +1,4 @@
-"""Queries as functions of arrays, for use inside a program of your own: under jit, under vmap, differentiated.
+"""Queries as functions of arrays, for programs of your own: under jit, under vmap, differentiated.
 
     geometry = Geometry.of(Tracer(striptools.convert(mesh)), mesh.faces)
 
@@ -132,8 +132,10 @@ def all_hits(
         raise UsageError(f"{k} hits a ray", where="k", remedy=f"ask for 1 to {MOST_HITS}")
     origins, directions, reach = _as_rays(origins, directions, t_max)
     traced = _walked(geometry.walking(gather="all", most=k), origins, directions, reach)
-    each = (jnp.broadcast_to(a[..., None, :], (*traced.t.shape, 3)) for a in (origins, directions))
-    return _hits_of(geometry, positions, *each, traced.t, traced.name)
+    origins, directions = (
+        jnp.broadcast_to(a[..., None, :], (*traced.t.shape, 3)) for a in (origins, directions)
+    )
+    return _hits_of(geometry, positions, origins, directions, traced.t, traced.name)
 
 
 def any_hit(geometry: Geometry, origins: Any, directions: Any, t_max: Any = np.inf) -> Array:
@@ -187,7 +189,7 @@ def _walk(walker: _Walker, origins: Array, directions: Array, reach: Array) -> T
 @_walk.def_vmap
 def _walk_batch(
     size: int, batched: Any, walker: _Walker, origins: Array, directions: Array, reach: Array
-) -> tuple[Traced, Traced]:
+) -> tuple[Traced, Any]:
     """Walk the rays of all elements as one batch."""
     if any(jax.tree.leaves(batched[0])):
         raise UsageError("scenes cannot be batched", remedy="map over rays, not over geometries")
@@ -198,7 +200,7 @@ def _walk_batch(
     shape = rays[2].shape
     traced = _walk(walker, *(a.reshape(-1, *a.shape[2:]) for a in rays))
     results = Traced(*(a.reshape(*shape, *a.shape[1:]) if a.size else a for a in traced))
-    return results, Traced(*(bool(a.size) for a in traced))
+    return results, jax.tree.map(lambda a: a.size > 0, traced)
 
 
 def _hits_of(
