@@ -1,9 +1,10 @@
 """What a walk gathers in the place of the closest hit: all hits up to a number, or counts.
 
-All hits are kept sorted, by t and then by face, in as many lanes as are asked for: a k-buffer (Bavoil et al.,
-"Multi-Fragment Effects on the GPU Using the k-Buffer", I3D 2007) filled by insertion, so that nothing sorts
-or scatters and the loop stays hoisted. Once it is full, boxes beyond its last hit are left out. Counting
-leaves out nothing before t_max. Cost: a step of `most` lanes for each triangle of a leaf in which any is hit.
+All hits are kept sorted by t and then by face, as many as are asked for: a k-buffer (Bavoil et al.,
+"Multi-Fragment Effects on the GPU Using the k-Buffer", I3D 2007), filled by insertion from its end, so that
+nothing sorts or scatters and the loop stays hoisted. Once it is full, boxes beyond its last hit are left out.
+Counting leaves out nothing before t_max. Cost: of each hit found, a move for every kept one beyond it; and a
+copy of what is kept at each leaf.
 """
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -131,3 +132,13 @@ def _bits(t: Array) -> Array:
 
 def _float(bits: Array) -> Array:
     return lax.bitcast_convert_type(bits, jnp.float32)
+
+
+# Notes
+#
+# Bunny, camera rays, one thread, a machine with other work; time over that of the closest hit, expanded /
+# compressed: counting 0.96 / 1.09; all hits with k = 1 1.13 / 0.96, 4 2.2 / 2.0, 16 3.2 / 2.5, 64 6.6 / 4.7.
+#
+# Tried and lost: hits kept in vector lanes, each lane of a leaf inserted by compare and shift, k = 4 8.3 / 6.3,
+# k = 64 35 / 23 (XLA fuses the eight insertions and computes the first of them again and again); counting
+# without a cond of its own 0.9 / 3.2 to 4.2; one ray at a time in the place of two 1.0 to 1.15.
