@@ -139,6 +139,6 @@ def _float(bits: Array) -> Array:
 # Bunny, camera rays, one thread, a machine with other work; time over that of the closest hit, expanded /
 # compressed: counting 0.96 / 1.09; all hits with k = 1 1.13 / 0.96, 4 2.2 / 2.0, 16 3.2 / 2.5, 64 6.6 / 4.7.
 #
-# Tried and lost: hits kept in vector lanes, each lane of a leaf inserted by compare and shift, k = 4 8.3 / 6.3,
-# k = 64 35 / 23 (XLA fuses the eight insertions and computes the first of them again and again); counting
-# without a cond of its own 0.9 / 3.2 to 4.2; one ray at a time in the place of two 1.0 to 1.15.
+# Tried and lost: hits kept in vector lanes, each lane of a leaf inserted by compare and shift, k = 4 8.3 /
+# 6.3, k = 64 35 / 23 (XLA fuses the eight insertions and computes the first of them again and again);
+# counting without a cond of its own 0.9 / 3.2 to 4.2; one ray at a time in the place of two 1.0 to 1.15.
