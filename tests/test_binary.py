@@ -156,7 +156,7 @@ def test_walking_all_rays_at_once_gives_the_same(ball):
 @pytest.mark.parametrize(("any_hit", "counting"), [(False, False), (True, False), (False, True)])
 def test_the_walk_is_hoisted(any_hit, counting):
     tracer = Tracer(under(small_scene(), leaf_size=1), device="cpu")
-    options = tracer._options(any_hit=any_hit, count=counting)
+    options = tracer._options(any_hit=any_hit, counting=counting)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
     text = program(tracer._mesh, options).lower(tracer._scene, rays).compile().as_text()
     assert 'xla_cpu_small_call="true"' in text

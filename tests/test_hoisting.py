@@ -41,20 +41,30 @@ def scene_under(hierarchy):
     return scene
 
 
-def compiled_text(any_hit, steps=False, hierarchy="reducem"):
-    tracer = Tracer(scene_under(hierarchy), device="cpu")
-    options = tracer._options(any_hit=any_hit, count=steps)
+def compiled_text(hierarchy="reducem", resident="auto", **asked):
+    tracer = Tracer(scene_under(hierarchy), device="cpu", resident=resident)
+    options = tracer._options(**asked)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
     lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
     return lowered.compile().as_text()
 
 
-@pytest.mark.parametrize(
-    "hierarchy", ["reducem", "slbvh", "kdtree", "kdtree, mailbox", "kdtree, strips, mailbox"]
-)
-@pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
-def test_walks_are_hoisted(any_hit, steps, hierarchy):
-    text = compiled_text(any_hit, steps, hierarchy)
+GATHERING = [
+    {"gather": gather, "most": most, "resident": resident}
+    for gather, most in (("all", 1), ("all", 16), ("all", 128), ("count", 1), ("windings", 1))
+    for resident in ("expanded", "compressed")
+]
+
+OTHERS = [
+    {"hierarchy": hierarchy, **asked}
+    for hierarchy in ("slbvh", "kdtree", "kdtree, mailbox", "kdtree, strips, mailbox")
+    for asked in ({}, {"any_hit": True}, {"counting": True})
+]
+
+
+@pytest.mark.parametrize("asked", [{}, {"any_hit": True}, {"counting": True}, *GATHERING, *OTHERS])
+def test_walks_are_hoisted(asked):
+    text = compiled_text(**asked)
     assert 'xla_cpu_small_call="true"' in text
     assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
     assert loops_outside_hoisted_calls(text) == []

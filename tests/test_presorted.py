@@ -434,7 +434,7 @@ def test_threads_trace_the_same(ball):
 @pytest.mark.parametrize("node_test", NODE_TESTS)
 def test_walks_are_hoisted(ball, node_test, any_hit, count):
     tracer = tracer_of(ball, 3, node_test)
-    given_options = tracer._options(any_hit=any_hit, count=count)
+    given_options = tracer._options(any_hit=any_hit, counting=count)
     lowered = program(tracer._mesh, given_options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
     text = lowered.compile().as_text()
     assert 'xla_cpu_small_call="true"' in text

@@ -286,7 +286,7 @@ def test_walks_are_hoisted(any_hit, steps, remap):
     from test_hoisting import loops_outside_hoisted_calls
 
     tracer = both(scene_of(Mesh(*sphere(3)), remap=remap))[1]
-    options = tracer._options(any_hit=any_hit, count=steps)
+    options = tracer._options(any_hit=any_hit, counting=steps)
     lowered = program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
     text = lowered.compile().as_text()
     assert 'xla_cpu_small_call="true"' in text

@@ -34,6 +34,13 @@ def test_the_main_job_runs(tmp_path: Path) -> None:
     assert striptools.open(scene).triangle_count > 130_000
 
 
+def test_the_sample_of_queries_runs(tmp_path: Path) -> None:
+    said = run_script(SAMPLES / "queries.py", folder=tmp_path)
+    assert "hits of a ray: 2 to 2;" in said
+    assert "go 1.000 farther" in said
+    assert float(re.search(r"signed distances within (\S+)", said)[1]) < 0.01
+
+
 def test_the_ray_sample_runs(tmp_path: Path) -> None:
     said = run_script(SAMPLES / "trace_rays.py", folder=tmp_path)
     assert "rays hit" in said

@@ -491,7 +491,7 @@ def loop_carries(jaxpr):
 
 def carries_of(scene, any_hit=False, count=False):
     tracer = Tracer(scene, device="cpu", threads=1)
-    options = tracer._options(any_hit=any_hit, count=count)
+    options = tracer._options(any_hit=any_hit, counting=count)
     traced = program(tracer._mesh, options).trace(tracer._scene, np.zeros((256, ROW), np.float32))
     return loop_carries(traced.jaxpr.jaxpr)
 

@@ -60,9 +60,14 @@ def try_every_triangle(scene, origins, directions, t_max=np.inf):
 
 
 def _try_one(corners, ids, turns, o, d, t_max):
-    miss = (np.float32(np.inf), -1, np.float32(0), np.float32(0))
+    hits = try_one(corners, ids, turns, o, d, t_max)
+    return hits[0] if hits else (np.float32(np.inf), -1, np.float32(0), np.float32(0))
+
+
+def try_one(corners, ids, turns, o, d, t_max=np.inf, *, all_signs=False):
+    """All hits of a ray, by t and then by face: (t, face, u, v); with `all_signs` those far from it too."""
     if not (np.isfinite(o).all() and np.isfinite(d).all() and np.abs(d).max() >= np.finfo(np.float32).tiny):
-        return miss
+        return []
     o, d = flushed(o), flushed(d)
     length = np.float32(2.0) ** np.floor(np.log2(np.abs(d).max()))
     d, t_max = flushed(d / length), t_max * length
@@ -83,13 +88,14 @@ def _try_one(corners, ids, turns, o, d, t_max):
     t = flushed(rounded(a * height[:, 0]) + rounded(b * height[:, 1])) + rounded(c * height[:, 2])
     t = flushed(t)
     t = np.where(whole < 0, -t, t) / np.abs(whole)
-    hit = np.flatnonzero(inside & around & (whole != 0) & (t > 0) & (t < t_max) & near(corners, o, d, t))
-    if not len(hit):
-        return miss
-    k = hit[np.lexsort((ids[hit], t[hit]))[0]]
-    weights = np.array([a[k], b[k], c[k]]) / whole[k]
-    by_corner = weights[(np.arange(3) - turns[k]) % 3]
-    return t[k] / length, ids[k], by_corner[1], by_corner[2]
+    met = inside & around & (whole != 0) & (t > 0) & (t < t_max)
+    hit = np.flatnonzero(met & (all_signs | near(corners, o, d, t)))
+    found = []
+    for k in hit[np.lexsort((ids[hit], t[hit]))]:
+        weights = np.array([a[k], b[k], c[k]]) / whole[k]
+        by_corner = weights[(np.arange(3) - turns[k]) % 3]
+        found.append((t[k] / length, ids[k], by_corner[1], by_corner[2]))
+    return found
 
 
 def near(corners, o, d, t):

@@ -7,7 +7,7 @@ from striptools.trace.device import SlowTracingWarning, prepare_jax
 
 prepare_jax()
 
-from striptools.trace.hit import Hits  # noqa: E402
+from striptools.trace.hit import AllHits, ClosestPoints, Hits  # noqa: E402
 from striptools.trace.tracer import Tracer  # noqa: E402
 
-__all__ = ["Hits", "SlowTracingWarning", "Tracer"]
+__all__ = ["AllHits", "ClosestPoints", "Hits", "SlowTracingWarning", "Tracer"]

@@ -35,3 +35,48 @@ class Hits:
     def hit(self) -> np.ndarray:
         """(r,) bool: which rays hit something."""
         return self.face >= 0
+
+
+@dataclass(frozen=True, eq=False)
+class AllHits:
+    """The first hits of each of r rays, up to k, by t and then by face.
+
+    Each face that a ray meets is a hit of its own: a ray through an edge meets both faces that share it, one
+    through a corner all of them, at the same t or nearly so.
+
+    Attributes:
+        t: (r, k) float32, as in `Hits`; inf where there are fewer hits.
+        face: (r, k) int32; -1 where there are fewer.
+        u: (r, k) float32.
+        v: (r, k) float32.
+        triangle: (r, k) int32; -1 where there are fewer.
+        count: (r,) int32, how many of the k there are.
+    """
+
+    t: Float32[np.ndarray, "r k"]
+    face: Int32[np.ndarray, "r k"]
+    u: Float32[np.ndarray, "r k"]
+    v: Float32[np.ndarray, "r k"]
+    triangle: Int32[np.ndarray, "r k"]
+    count: Int32[np.ndarray, " r"]
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestPoints:
+    """The point of the surface that is closest to each of r points.
+
+    Attributes:
+        point: (r, 3) float32, in the frame of the scene's positions; NaN where there is none.
+        distance: (r,) float32; inf where there is none; negative inside, where signs were asked for.
+        face: (r,) int32, as in `Hits`; -1 where there is none.
+        u: (r,) float32, the weight of the face's second corner, as in `Hits`.
+        v: (r,) float32, the weight of its third corner.
+        triangle: (r,) int32, as in `Hits`; -1 where there is none.
+    """
+
+    point: Float32[np.ndarray, "r 3"]
+    distance: Float32[np.ndarray, " r"]
+    face: Int32[np.ndarray, " r"]
+    u: Float32[np.ndarray, " r"]
+    v: Float32[np.ndarray, " r"]
+    triangle: Int32[np.ndarray, " r"]

@@ -36,8 +36,11 @@ rays."""
 READY_IN_FLIGHT = 2
 """The same of CPU devices: more only push each other's rays out of the cache."""
 
-_RAYS = PartitionSpec("device")
-_EVERYWHERE = PartitionSpec()
+RAYS = PartitionSpec("device")
+"""One share of the rays a device."""
+
+EVERYWHERE = PartitionSpec()
+"""The whole on each device."""
 
 
 def device_mesh(devices: list[jax.Device]) -> Mesh:
@@ -48,7 +51,7 @@ def device_mesh(devices: list[jax.Device]) -> Mesh:
 def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
     """Put a whole scene on each device."""
     with quiet_jax():
-        return jax.device_put(scene, NamedSharding(mesh, _EVERYWHERE))
+        return jax.device_put(scene, NamedSharding(mesh, EVERYWHERE))
 
 
 @lru_cache(maxsize=64)
@@ -61,8 +64,8 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
-        in_specs=(_EVERYWHERE, *(_RAYS,) * arrays),
-        out_specs=_RAYS,
+        in_specs=(EVERYWHERE, *(RAYS,) * arrays),
+        out_specs=RAYS,
         check_vma=False,
     )
     return jax.jit(split)
@@ -80,10 +83,16 @@ def stream(
     scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
     """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
-    compiled = program(mesh, options)
-    split = NamedSharding(mesh, _RAYS)
+    yield from stream_through(program(mesh, options), scene, rays, mesh, GPU_TILES)
+
+
+def stream_through(
+    compiled: Any, scene: WalkScene, rays: tuple[np.ndarray, ...], mesh: Mesh, sizes: tuple[int, ...]
+) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
+    """The same by any program of a scene and arrays; places left over hold zeros."""
+    split = NamedSharding(mesh, RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
-    for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES):
+    for part, per_device in tiles(len(rays[0]), mesh.size, sizes):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
             waiting.append((part, per_device, compiled(scene, *jax.device_put(padded, split))))
@@ -125,11 +134,12 @@ def stream_ready(
     packed = _Pipe(scene, mesh, options, PACKET_TILES, (-(-count // PACKET), PACKET_ROW), (PACKET,))
     alone = np.zeros(min(TILES[-1], count) + PACKET, np.int32)
     seen = layout.seen_by_packets
+    assert seen is not None
     begin = 0
     while begin < count:
         buffers = packed.take()
         places = (buffers.rows, buffers.rows.view(np.int32), buffers.at, alone, dropped)
-        live, left, begin = ready_packets(*rays, begin, *seen, *places)
+        live, left, begin = ready_packets(*rays, begin, seen.frame, seen.box, seen.density, *places)
         yield from packed.send(buffers, live)
         if left:
             yield from _send_each(single, layout, rays, alone[:left], dropped)
@@ -180,7 +190,7 @@ class _Pipe:
     ) -> None:
         self._scene, self._mesh, self._sizes, self._lanes = scene, mesh, sizes, lanes
         self._compiled = program(mesh, options, bool(lanes))
-        self._split = NamedSharding(mesh, _RAYS)
+        self._split = NamedSharding(mesh, RAYS)
         room = next((size for size in sizes if size * mesh.size >= shape[0]), sizes[-1])
         self._shape = room * mesh.size, shape[1]
         self._spare: list[_Buffers] = []

@@ -81,3 +81,7 @@ class Layout(Protocol):
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`."""
         ...
+
+    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles (k,) of what a walk names, and turns: corner j is the face's (j + turn) % 3."""
+        ...

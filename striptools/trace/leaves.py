@@ -73,6 +73,10 @@ class ExpandedLayout:
         kept = _arrays_in(self.arrays)
         return sum(a.nbytes for a in kept) + self.leaves.place.nbytes + self.leaves.triangle_of.nbytes
 
+    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles of what the walk names, and how the corners of its leaves are turned."""
+        return names, self.leaves.triangle_of[names], self.leaves.place[names] & 3
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         self.leaves.weigh(rays, at, traced, found)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from striptools.errors import LimitError
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
 from striptools.trace.counters import Counters
@@ -17,6 +18,9 @@ from striptools.trace.walk_packed import MARGIN, PackedScene
 if TYPE_CHECKING:
     from striptools.reducem.blocks import Blocks
     from striptools.reducem.scene import Scene
+
+MOST_BLOCKS = 2**23
+"""Blocks that a hit can name: an int32 holds 256 times as much."""
 
 STEPS = 16
 """Size classes to each doubling: 4 % of memory at most for programs that scenes share."""
@@ -75,6 +79,13 @@ class PackedLayout:
         held = (arrays.nodes, arrays.headers, arrays.words, arrays.first_run, arrays.runs, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
 
+    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles of what the walk names, and how the corners of the file's are turned."""
+        triangles = (self.arrays.headers[names >> 8, 0] + (names & 0xFF)).astype(np.int32)
+        faces = self.arrays.faces[triangles] if self.arrays.has_faces else triangles
+        turns = self.rotations[triangles] if len(self.rotations) else np.zeros(len(names), np.uint8)
+        return faces, triangles, turns
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
@@ -97,6 +108,12 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     size class, so that scenes of like size share a program.
     """
     packed, blocks = scene.with_boxes(threads), scene.blocks
+    if blocks.count > MOST_BLOCKS:
+        raise LimitError(
+            f"{blocks.count} blocks are more than {MOST_BLOCKS}",
+            where="compressed scene",
+            remedy="trace it expanded",
+        )
     assert packed.first_run is not None
     assert packed.runs is not None
     laid: Callable[[np.ndarray], np.ndarray] = _padded if scene.packed.runs is None else np.asarray

@@ -4,20 +4,28 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int32
 
-from striptools.errors import StriptoolsError, UsageError
+from striptools.errors import UsageError
 from striptools.trace.alternatives import lay_out_alternative
+from striptools.trace.closest import closest_points, nothing_closest
+from striptools.trace.containment import ContainKind, rays_from, winding_numbers
 from striptools.trace.counters import KINDS, counters_of
-from striptools.trace.device import DeviceKind, trace_devices
-from striptools.trace.hit import Hits
+from striptools.trace.device import DeviceKind, quiet_jax, trace_devices
+from striptools.trace.gathering import all_hits, check_ended, counts
+from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
-from striptools.trace.walk import MISS, STUCK, WalkOptions
+from striptools.trace.walk import MISS, WalkOptions
+from striptools.trace.walk_gather import GatherKind
+from striptools.trace.walk_packed import PackedScene
+from striptools.trace.walk_points import PointOptions
+from striptools.trace.walk_wide import WideScene
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
@@ -182,10 +190,11 @@ class Tracer:
         dropped = np.zeros(count, np.uint8)
         counted = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
-        for at, traced in self._stream(rays, dropped, any_hit=False, count=counters, packets=packets):
+        options = self._options(counting=counters)
+        for at, traced in self._stream(rays, dropped, options, packets=packets):
             if counters:
                 counted[at] = traced[2]
-            _check_ended(traced[1])
+            check_ended(traced[1])
             # On this side, while the devices are at the next rays.
             self._layout.weigh(rays, at, traced, found)
         if counters:
@@ -193,15 +202,14 @@ class Tracer:
         return Hits(t, face, u, v, triangle, counters_of(counted) if counters else None)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, count: bool, packets: bool
+        self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
-        if self._empty:
+        if options is None:
             return
-        options = self._options(any_hit=any_hit, count=count)
         if not options.batch:
             given = (self._scene, self._layout, rays, dropped, self._mesh, options)
-            in_packets = packets and not count and self._layout.seen_by_packets is not None
+            in_packets = packets and not options.counting and self._layout.seen_by_packets is not None
             yield from stream_ready(*given, in_packets)
             return
         for part, traced in stream(self._scene, rays, self._mesh, options):
@@ -219,16 +227,158 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, any_hit=True, count=False, packets=packets):
-            _check_ended(traced[1])
+        for at, traced in self._stream(rays, dropped, self._options(any_hit=True), packets=packets):
+            check_ended(traced[1])
             there = at >= 0
             hit[at[there]] = traced[1][there] >= 0
         return hit
 
-    def _options(self, *, any_hit: bool, count: bool) -> WalkOptions:
+    def all_hits(
+        self, origins: np.ndarray, directions: np.ndarray, *, k: int, t_max: np.ndarray | float | None = None
+    ) -> AllHits:
+        """Find the first k things that each ray hits, by t and then by face.
+
+        The first is the closest hit. Programs are compiled for powers of two.
+
+        Args:
+            origins: (r, 3) in the model's unit.
+            directions: (r, 3).
+            k: 1 to 1024.
+            t_max: As for `closest_hit`.
+
+        Raises:
+            UsageError: As for `closest_hit`, or k is out of range.
+            StriptoolsError: As for `closest_hit`.
+        """
+        layout = None if self._empty else self._layout
+        return all_hits(self._gather, layout, checked_rays(origins, directions, t_max), k)
+
+    def count_hits(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
+    ) -> Int32[np.ndarray, " r"]:
+        """Count all faces that each ray hits, every one of those that share an edge or a corner it hits.
+
+        Arguments and errors are those of `closest_hit`.
+        """
+        return counts(self._gather, checked_rays(origins, directions, t_max), "count")
+
+    def closest_point(self, points: np.ndarray, *, signed: bool = False) -> ClosestPoints:
+        """Find the point of the surface closest to each point.
+
+        Where on its triangle it is, and how far, is computed in float64. Which triangle it is was decided in
+        float32: none is closer by more than 2**-20 of the largest coordinate of point and scene. Of equal
+        ones it is the least face.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times
+                as far as the scene reaches, has none.
+            signed: Make distances negative inside, by `contains` by parity: for closed meshes.
+
+        Raises:
+            UsageError: The points are not of this shape.
+            StriptoolsError: As for `closest_hit`.
+        """
+        checked = checked_points(points)
+        if self._empty:
+            found = nothing_closest(len(checked))
+        else:
+            self._need_wide_nodes()
+            options = PointOptions(self._stack_size, self._on_gpu, self._layout.decode)
+            found = closest_points(self._scene, self._layout, checked, self._mesh, options)
+        if signed:
+            inside = self.contains(checked)
+            found.distance[inside] *= -1
+        return found
+
+    def contains(self, points: np.ndarray, *, method: ContainKind = "parity") -> Bool[np.ndarray, " r"]:
+        """Say of each point whether it is inside the mesh, which has to be closed.
+
+        By parity, a ray from the point leaves the mesh an odd number of times: fast; edges and corners in its
+        way are counted right, and it does not matter how faces are wound. By winding, the generalised winding
+        number is beyond a half: slow, for each point takes each triangle, but it bears holes; faces must be
+        wound one way. Of points on the surface, and of meshes with holes by parity, nothing is promised. A
+        point that is not finite is outside.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions.
+            method: "parity" or "winding".
+
+        Raises:
+            UsageError: The points are not of this shape, there is no such method, or it is winding and the
+                scene is kept compressed.
+            StriptoolsError: As for `closest_hit`.
+        """
+        if method == "winding":
+            return np.abs(self.winding_numbers(points)) > 0.5
+        if method != "parity":
+            raise UsageError(f"no such method: {method!r}", remedy="use parity or winding")
+        return counts(self._gather, rays_from(checked_points(points)), "windings") % 2 == 1
+
+    def winding_numbers(self, points: np.ndarray) -> Float32[np.ndarray, " r"]:
+        """The generalised winding number of the mesh at each point, 0 at points that are not finite.
+
+        1 inside and 0 outside of a closed mesh whose faces are wound counter-clockwise from outside; in
+        between where there are holes. Each point takes each triangle.
+
+        Args:
+            points: (r, 3) in the frame of the scene's positions.
+
+        Raises:
+            UsageError: The points are not of this shape, or the scene is kept compressed.
+        """
+        checked = checked_points(points)
+        if self._empty:
+            return np.zeros(len(checked), np.float32)
+        if self._resident == "compressed":
+            raise UsageError(
+                "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
+            )
+        return winding_numbers(self._layout.arrays, checked)
+
+    def program_parts(self) -> tuple[Any, WalkOptions]:
+        """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
+
+        Raises:
+            UsageError: There is nothing to trace.
+        """
+        options = self._options()
+        if options is None:
+            raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
+        with quiet_jax():
+            return jax.device_put(self._layout.arrays, self.devices[0]), options
+
+    def _need_wide_nodes(self) -> None:
+        """Refuse what only the walk of wide nodes can do."""
+        if not isinstance(self._layout.arrays, WideScene | PackedScene):
+            raise UsageError(
+                "only closest hits and any hits go through this hierarchy",
+                where="hierarchy",
+                remedy="use hierarchy rebuilt",
+            )
+
+    def _gather(
+        self, rays: Rays, kind: GatherKind, most: int
+    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        dropped = np.zeros(len(rays[0]), np.uint8)
+        return self._stream(rays, dropped, self._options(gather=kind, most=most))
+
+    def _options(
+        self,
+        *,
+        any_hit: bool = False,
+        counting: bool = False,
+        gather: GatherKind | None = None,
+        most: int = 0,
+    ) -> WalkOptions | None:
+        """What to compile in; None where there is nothing to trace."""
+        if self._empty:
+            return None
+        if gather is not None:
+            self._need_wide_nodes()
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        return WalkOptions(side_by_side, any_hit, count, self._stack_size, self._on_gpu, decode)
+        given = (self._stack_size, self._on_gpu, decode, gather, most)
+        return WalkOptions(side_by_side, any_hit, counting, *given)
 
 
 def _check_kinds(hierarchy: str, resident: str) -> None:
@@ -285,6 +435,20 @@ def checked_rays(
     return start, way, np.ascontiguousarray(np.broadcast_to(reach, len(start)))
 
 
+def checked_points(points: np.ndarray) -> Float32[np.ndarray, "r 3"]:
+    """Points as float32, (r, 3).
+
+    Raises:
+        UsageError: They are not.
+    """
+    given = _as_float32(points, "points")
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise UsageError(
+            f"of shape {given.shape}", where="points", remedy="give an array of shape (points, 3)"
+        )
+    return given
+
+
 def _as_float32(values: Any, name: str) -> Float32[np.ndarray, "..."]:
     """Round to float32; what is too large for it becomes infinite, so that its ray is a miss."""
     try:
@@ -297,11 +461,3 @@ def _as_float32(values: Any, name: str) -> Float32[np.ndarray, "..."]:
         raise UsageError(
             f"not an array of numbers: {error}", where=name, remedy="give float32 values"
         ) from error
-
-
-def _check_ended(face: np.ndarray) -> None:
-    stuck = int((face == STUCK).sum())
-    if stuck:
-        raise StriptoolsError(
-            f"the walk of {stuck} rays did not end", where="scene hierarchy", remedy="convert the model again"
-        )

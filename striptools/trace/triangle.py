@@ -49,7 +49,7 @@ class Shear(NamedTuple):
 class Edges(NamedTuple):
     """Edge functions of a triangle, heights of its corners, and whether the corners lie around the ray.
 
-    Corner weights are a, b, c over their sum.
+    Corner weights are a, b, c over their sum; y are the corners' second sheared coordinates.
     """
 
     a: Array
@@ -57,6 +57,7 @@ class Edges(NamedTuple):
     c: Array
     heights: Corners
     around: Array
+    y: Corners
 
 
 def shear_of(origin: Array, direction: Array) -> Shear:
@@ -94,6 +95,7 @@ def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear) -> Edges:
         rounded(bx * ay) - rounded(by * ax),
         (a, b, c),
         _straddle(ax, bx, cx) & _straddle(ay, by, cy),
+        (ay, by, cy),
     )
 
 
@@ -111,13 +113,43 @@ def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
         edges: Of the triangles.
         turn: Which corner is the first in the canonical order; None where that is corner a.
     """
-    a, b, c, heights, around = edges
+    a, b, c, heights, around, _ = edges
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     determinant = _summed(a, b, c, turn)
     scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
     return lax.optimization_barrier(quotient(scaled_t, with_sign_of(determinant, sign)))
+
+
+def windings_of(edges: Edges, shear: Shear) -> Array:
+    """Whether the ray leaves a body through each triangle ahead, int32: 1 leaves, -1 enters, 0 neither.
+
+    The point 0 of the sheared plane is in a triangle where the half-line to its right is crossed once, by an
+    edge that goes up or by one that goes down (Hormann & Agathos, "The Point in Polygon Problem for Arbitrary
+    Polygons", Computational Geometry 20(3), 2001, section 2). An edge goes up from y <= 0 to y > 0, and is
+    crossed where its edge function tells: the face on its other side sees the same crossing with the other
+    sign, bit for bit, zeros included. So a ray through an edge or a corner of a closed mesh is counted as if
+    it passed beside it, and never twice.
+
+    """
+    a, b, c, heights, _, y = edges
+    up = [at > 0 for at in y]
+    down = [at <= 0 for at in y]
+
+    def crossed(area: Array, first: int, second: int) -> Array:
+        # `area` is twice that of the triangle of 0, the edge's second end and its first.
+        rises = down[first] & up[second] & (area < 0)
+        falls = up[first] & down[second] & (area > 0)
+        return jnp.where(rises, jnp.int32(1), jnp.int32(0)) - jnp.where(falls, jnp.int32(1), jnp.int32(0))
+
+    turns = crossed(c, 0, 1) + crossed(a, 1, 2) + crossed(b, 2, 0)
+    scaled_t = rounded(a * heights[0]) + rounded(b * heights[1]) + rounded(c * heights[2])
+    # Where all corners are on one side no weight, which may be noise, has a say.
+    nearest, farthest = smaller(smaller(*heights[:2]), heights[2]), larger(larger(*heights[:2]), heights[2])
+    ahead = (nearest > 0) | ((farthest > 0) & (jnp.where(turns > 0, -scaled_t, scaled_t) > 0))
+    outward = jnp.where(shear.z < 0, -turns, turns)
+    return jnp.where(ahead, outward, 0)
 
 
 def _summed(a: Array, b: Array, c: Array, turn: Array | None) -> Array:

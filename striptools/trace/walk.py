@@ -35,7 +35,8 @@ from jaxtyping import Int32
 from striptools.trace.box import Slab, slab_of
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
-from striptools.trace.triangle import Shear, shear_of
+from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, shear_of
+from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 
 WIDTH = 8
 FLOATS = 17
@@ -81,6 +82,33 @@ class Best(NamedTuple):
     name: Array
 
 
+Found = Best | Gathered
+"""What a ray has found so far: both have a `nearest`, beyond which nothing matters."""
+
+
+class Leaf(NamedTuple):
+    """The triangles of a leaf, a lane each.
+
+    Attributes:
+        x, y, z: Corners a, b, c along three axes, (8,) float32 each; NaN in empty lanes if `filled` is None.
+        turn: (8,) which corner is the first in the canonical order; None where that is corner a.
+        filled: (8,) bool, which lanes hold a triangle; None where empty ones hold NaN.
+        name: (8,) int32, what the scene calls the triangles.
+    """
+
+    x: Corners
+    y: Corners
+    z: Corners
+    turn: Array | None
+    filled: Array | None
+    name: Array
+
+    def crossings(self, shear: Shear) -> Array:
+        """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
+        t = crossing_of(edges_of(self.x, self.y, self.z, shear), self.turn)
+        return t if self.filled is None else jnp.where(self.filled, t, jnp.float32(0))
+
+
 class WalkScene(Protocol):
     """What a walk asks of a scene: a NamedTuple of arrays on a device."""
 
@@ -107,11 +135,19 @@ class WalkScene(Protocol):
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         ...
 
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, lo xyz and hi xyz, scaled; NaN in empty lanes."""
+        ...
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane: a node, or a negative number other than `DONE` that names a leaf.
 
         `DONE` for the last node and a lane above 7, which are at the bottom of each stack.
         """
+        ...
+
+    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: "Decode | None") -> Leaf:
+        """The triangles of a leaf, their corners along these axes."""
         ...
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: "WalkOptions") -> Best:
@@ -141,6 +177,8 @@ class WalkOptions(NamedTuple):
         stack_size: Entries of the stack: the depth of the tree and two more.
         batch: Walk all rays at once by vmap (GPU), not one group after the other (CPU).
         decode: How leaves are decoded, where they are packed.
+        gather: What to gather in the place of the closest hit, if anything.
+        most: How many hits to gather, where all are.
     """
 
     interleave: int
@@ -149,6 +187,8 @@ class WalkOptions(NamedTuple):
     stack_size: int
     batch: bool = False
     decode: "Decode | None" = None
+    gather: GatherKind | None = None
+    most: int = 0
 
 
 class Decode(NamedTuple):
@@ -173,14 +213,16 @@ class Traced(NamedTuple):
     """One entry a ray; what was not asked for has none.
 
     Attributes:
-        t: (r,) float32; (0,) of any hit.
-        name: (r,) int32, what the scene calls the triangle hit.
+        t: (r,) float32; (0,) of any hit; (r, most), by t and then by face, where all hits are gathered.
+        name: (r,) int32, what the scene calls the triangle hit; (r, most) where all hits are gathered.
         counters: (r, 6) int32, in the order of `Counters`; (r, 0) where nothing is counted.
+        counted: (r,) int32, how many hits there are, or windings, where those are gathered; else (0,).
     """
 
     t: Array
     name: Array
     counters: Array
+    counted: Array
 
 
 class ReadyRay(NamedTuple):
@@ -301,11 +343,10 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     else:
         # One group's stacks serve the next: only their bottom is read before it is written.
         walked = lax.scan(walk, stacks, rows)[1]
-    t, name = walked.t.reshape(-1), walked.name.reshape(-1)
-    counters = walked.counters.reshape(len(ready), -1)
+    t, name, counters, counted = (a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]) for a in walked)
     if options.any_hit:
         t = jnp.zeros(0)
-    return Traced(t, name, counters)
+    return Traced(t, name, counters, counted.reshape(-1))
 
 
 def ready_ray(row: Array) -> ReadyRay:
@@ -408,6 +449,7 @@ class _Walked(NamedTuple):
     t: Array
     name: Array
     counters: Array
+    counted: Array
 
 
 class _State(NamedTuple):
@@ -434,7 +476,7 @@ class _Walk:
             found = found | at(place)
         return found & (state.turns <= len(self.rays) * self.scene.node_count)
 
-    def visit_nodes(self, state: _State, bests: tuple[Best, ...]) -> _State:
+    def visit_nodes(self, state: _State, bests: tuple[Found, ...]) -> _State:
         """Each ray that is at an inner node visits it."""
         visits = [
             _visit_node(self.scene, *each)
@@ -446,7 +488,7 @@ class _Walk:
         at_node = [place.child >= 0 for place in state.places]
         return _State(places, stacks, state.turns + 1, self.count(state.visits, at_node, _A_NODE))
 
-    def visit_leaves(self, state: _State, bests: tuple[Best, ...]) -> tuple[_State, tuple[Best, ...]]:
+    def visit_leaves(self, state: _State, bests: tuple[Found, ...]) -> tuple[_State, tuple[Found, ...]]:
         """Each ray that is at a leaf tests it and goes on."""
         at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
         after = [
@@ -466,16 +508,19 @@ class _Walk:
             visits = tuple(each + _A_TRIANGLE * count for each, count in zip(visits, tested, strict=True))
         return state._replace(places=tuple(a[0] for a in after), visits=visits), tuple(a[1] for a in after)
 
-    def leave_leaf(self, k: int, state: _State, best: Best) -> tuple[Place, Best]:
+    def leave_leaf(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
-        best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
+        if isinstance(best, Gathered):
+            best = gather_leaf(self.scene, ray.shear, ray.t_max, place.child, best, self.options)
+        else:
+            best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
         there = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
         return there, best
 
-    def stay(self, k: int, state: _State, best: Best) -> tuple[Place, Best]:
+    def stay(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
         """Ray k is at no leaf."""
         return state.places[k], best
 
@@ -496,12 +541,10 @@ def _walk_group(
     walk = _Walk(scene, rays, options)
     zero = jnp.int32(0)
     places = tuple(ray.start for ray in rays)
-    bests = tuple(
-        Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32)) for ray in rays
-    )
+    bests = tuple(_nothing_found(ray, options) for ray in rays)
     visits = tuple(ray.visited * _A_NODE for ray in rays) if options.counting else ()
 
-    def nodes_then_leaves(carried: tuple[_State, tuple[Best, ...]]) -> tuple[_State, tuple[Best, ...]]:
+    def nodes_then_leaves(carried: tuple[_State, tuple[Found, ...]]) -> tuple[_State, tuple[Found, ...]]:
         state, bests = carried
         state = lax.while_loop(
             lambda s: walk.goes_on(s, lambda place: place.child >= 0),
@@ -516,15 +559,27 @@ def _walk_group(
         (_State(places, stacks, zero, visits), bests),
     )
     results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
-    t, name = (jnp.stack([r[k] for r in results]) for k in range(2))
-    counted = jnp.zeros((len(rays), 0), jnp.int32)
+    t, name, count = (jnp.stack([r[k] for r in results]) for k in range(3))
+    counters = jnp.zeros((len(rays), 0), jnp.int32)
     if visits:
-        counted = jnp.stack([jnp.stack(scene.counters_of(*each)) for each in state.visits])
-    return state.stacks, _Walked(t, name, counted)
+        counters = jnp.stack([jnp.stack(scene.counters_of(*each)) for each in state.visits])
+    return state.stacks, _Walked(t, name, counters, count)
 
 
-def _result(scene: WalkScene, ray: ReadyRay, place: Place, best: Best, any_hit: bool) -> tuple[Array, Array]:
-    """What is reported of a ray: t in the caller's units, and the name of the triangle."""
-    name = closest_name(best, any_hit, scene)
-    t = jnp.where(name < 0, jnp.float32(jnp.inf), best.nearest * ray.t_unit)
-    return t, jnp.where(place.child != DONE, STUCK, name)
+def _nothing_found(ray: ReadyRay, options: WalkOptions) -> Found:
+    """What a walk has found before it starts."""
+    if options.gather is not None:
+        return nothing_gathered(ray.t_max, options.most)
+    return Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32))
+
+
+def _result(
+    scene: WalkScene, ray: ReadyRay, place: Place, best: Found, any_hit: bool
+) -> tuple[Array, Array, Array]:
+    """What is reported of a ray: t in the caller's units, the name of the triangle, what was counted."""
+    if isinstance(best, Gathered):
+        t, name, count = best.t, best.name, best.counted
+    else:
+        t, name, count = best.nearest, closest_name(best, any_hit, scene), jnp.zeros(0, jnp.int32)
+    t = jnp.where(name < 0, jnp.float32(jnp.inf), t * ray.t_unit)
+    return t, jnp.where(place.child != DONE, STUCK, name), count

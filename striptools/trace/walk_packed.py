@@ -36,12 +36,13 @@ from jax import Array, lax
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
+from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
     Best,
     Decode,
     Frame,
+    Leaf,
     Traced,
     WalkOptions,
     replaced,
@@ -116,6 +117,17 @@ class PackedScene(NamedTuple):
             high.append(far * slab.inverse[axis] - slab.high[axis])
         return passes(low, high, limit) & (planes[0] <= planes[3])
 
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
+        at = index(node)
+        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
+        origins = jnp.stack([head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF])
+        shifts = jnp.stack([head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28])
+        cells = origins[:, None] + (planes.reshape(2, 3, LANES).astype(jnp.uint32) << shifts[:, None])
+        boxes = _number(cells) * self.frame.unit[:, None] + self.frame.low[:, None]
+        return jnp.where(planes[0] <= planes[3], boxes.reshape(6, LANES), jnp.float32(jnp.nan))
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
         head = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
@@ -130,22 +142,26 @@ class PackedScene(NamedTuple):
         # The bottom of a stack has a lane that no node has.
         return jnp.where(lane > 7, DONE, child)
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
-        """Decode the triangles of a run and test them, each lane against its own closest hit."""
-        assert options.decode is not None
+    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The triangles of a run, decoded, their corners along these axes."""
+        assert decode is not None
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = lax.optimization_barrier(self._run_of(child))
         header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
         lane = jnp.arange(LANES, dtype=jnp.uint32)
-        corners = self._corners(header, run, options.decode.flips)
-        x, y, z = self._positions(header, corners, options.decode)
+        corners = self._corners(header, run, decode.flips)
+        x, y, z = self._positions(header, corners, decode)
         turn = _first_corner(x, y, z)
-        ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
-        t = crossing_of(edges_of(ax, ay, az, shear), turn)
-        t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
+        return Leaf(ax, ay, az, turn, lane <= (run >> 8 & 7), name)
+
+    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
+        """Decode the triangles of a run and test them, each lane against its own closest hit."""
+        leaf = self.leaf_of(shear.axes, child, options.decode)
+        t = leaf.crossings(shear)
         found = _any((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, name, options.any_hit), lambda: best)
+        return lax.cond(found, lambda: self._merged(best, t, leaf.name, options.any_hit), lambda: best)
 
     def triangles_of(self, child: Array) -> Array:
         """() int32: how many triangles a run has."""
@@ -173,12 +189,11 @@ class PackedScene(NamedTuple):
         return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
 
     def faces_of(self, names: Array) -> Array:
-        """The faces of triangles; a name that is none keeps its number."""
-        if not self.has_faces:
-            return names
+        """The faces of hits; a name that is none keeps its number."""
         block, place = index(names) >> 8, index(names) & 0xFF
-        first = _at(self.headers, (block, jnp.uint32(0)))
-        return jnp.where(names < 0, names, _at(self.faces, first + place))
+        triangle = _at(self.headers, (block, jnp.uint32(0))) + place
+        face = _at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
+        return jnp.where(names < 0, names, face)
 
     def _run_of(self, child: Array) -> tuple[Array, Array]:
         """The block of a leaf, and what is said of its run."""

@@ -190,7 +190,9 @@ def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Trac
         return _walk_packet(scene, _packet_of(row), stack, options)
 
     t, name = lax.scan(walk, stack, ready)[1]
-    return Traced(jnp.zeros(0) if options.any_hit else t, name, jnp.zeros(0, jnp.int32))
+    return Traced(
+        jnp.zeros(0) if options.any_hit else t, name, jnp.zeros(0, jnp.int32), jnp.zeros(0, jnp.int32)
+    )
 
 
 def _packet_of(row: Array) -> _Packet:
@@ -319,7 +321,7 @@ def _one_triangle(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: 
     def of_triangle(values: Array) -> Array:
         return lax.dynamic_slice(values, (lane,), (1,))[0]
 
-    x, y, z = (tuple(of_triangle(corner) for corner in axis) for axis in rows.axes)
+    x, y, z = ((of_triangle(a), of_triangle(b), of_triangle(c)) for a, b, c in rows.axes)
     turn = None if rows.turn is None else of_triangle(rows.turn)
     crossing = crossing_of(edges_of(x, y, z, packet.shear), turn)
     mine = of_triangle(rows.name)

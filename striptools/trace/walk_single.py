@@ -84,7 +84,7 @@ def walk_each(ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> T
         t, name, counted = jax.vmap(lambda row: one(stack, row)[1])(ready)
     else:
         t, name, counted = lax.scan(one, stack, ready)[1]
-    return Traced(jnp.zeros(0) if options.any_hit else t, name, counted)
+    return Traced(jnp.zeros(0) if options.any_hit else t, name, counted, jnp.zeros(0, jnp.int32))
 
 
 def is_live(ray: ReadyRay) -> Array:

@@ -10,7 +10,7 @@ from striptools.trace.counters import Counters
 from striptools.trace.leaf_blocks import corners_in, faces_in, test_block, triangles_in
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
-from striptools.trace.walk import WIDTH, Best, Frame, Traced, WalkOptions, walk_rays
+from striptools.trace.walk import WIDTH, Best, Decode, Frame, Leaf, Traced, WalkOptions, walk_rays
 from striptools.trace.walk_packets import LeafRows, walk_packets
 
 
@@ -45,8 +45,12 @@ class WideScene(NamedTuple):
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
+        return lanes_met(self.boxes_of(node), slab, limit)
+
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: the boxes of a node's children, scaled; NaN in empty lanes."""
         at = (index(node), jnp.uint32(0), jnp.uint32(0))
-        return lanes_met(lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0], slab, limit)
+        return lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0]
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; leaf q is -(q + 1)."""
@@ -56,6 +60,11 @@ class WideScene(NamedTuple):
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
         return test_block(self.blocks, index(-(child + 1)), shear, best)
+
+    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The triangles of a leaf, their corners along these axes."""
+        leaf = index(-(child + 1))
+        return Leaf(*corners_in(self.blocks, leaf, axes), None, None, faces_in(self.blocks, leaf))
 
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""

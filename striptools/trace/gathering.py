@@ -1,0 +1,68 @@
+"""All hits of rays, and how many there are: rays in, arrays out."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Int32
+
+from striptools.errors import StriptoolsError, UsageError
+from striptools.trace.hit import AllHits
+from striptools.trace.layout import Layout, Rays
+from striptools.trace.walk import MISS, STUCK
+from striptools.trace.walk_gather import GatherKind
+
+MOST_HITS = 1024
+"""The most hits of a ray that can be asked for: each triangle takes a step of as many lanes."""
+
+Parts = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
+"""Which rays are done, int32, and their results, as `walk.Traced` has them."""
+
+Stream = Callable[[Rays, GatherKind, int], Parts]
+"""Traces rays and gathers: the kind, and how many hits of each at most."""
+
+
+def all_hits(stream: Stream, layout: Layout | None, rays: Rays, k: int) -> AllHits:
+    """The first k hits of each ray; no layout where the scene is empty.
+
+    Raises:
+        UsageError: K is no number of hits.
+        StriptoolsError: A walk did not end.
+    """
+    if not 1 <= k <= MOST_HITS:
+        raise UsageError(f"{k} hits a ray", where="k", remedy=f"ask for 1 to {MOST_HITS}")
+    rows = (k, len(rays[0]))
+    t, u, v = np.full(rows, np.inf, np.float32), np.zeros(rows, np.float32), np.zeros(rows, np.float32)
+    face, triangle = np.full(rows, MISS), np.full(rows, MISS)
+    # A program is compiled for a power of two, of which a ray's first k hits are the first k.
+    for at, traced in stream(rays, "all", 1 << (k - 1).bit_length()):
+        check_ended(traced[1])
+        assert layout is not None
+        for j in range(k):
+            nth = (np.ascontiguousarray(traced[0][:, j]), np.ascontiguousarray(traced[1][:, j]))
+            if not (nth[1] >= 0).any():
+                break
+            layout.weigh(rays, at, nth, (t[j], face[j], u[j], v[j], triangle[j]))
+    t, face, u, v, triangle = (np.ascontiguousarray(a.T) for a in (t, face, u, v, triangle))
+    return AllHits(t, face, u, v, triangle, (face >= 0).sum(axis=1, dtype=np.int32))
+
+
+def counts(stream: Stream, rays: Rays, kind: GatherKind) -> Int32[np.ndarray, " r"]:
+    """What is counted of each ray.
+
+    Raises:
+        StriptoolsError: A walk did not end.
+    """
+    count = np.zeros(len(rays[0]), np.int32)
+    for at, traced in stream(rays, kind, 1):
+        check_ended(traced[1])
+        count[at] = traced[3]
+    return count
+
+
+def check_ended(name: np.ndarray) -> None:
+    """Raise a StriptoolsError where a walk did not end."""
+    stuck = int((name == STUCK).sum())
+    if stuck:
+        raise StriptoolsError(
+            f"the walk of {stuck} rays did not end", where="scene hierarchy", remedy="convert the model again"
+        )

@@ -1,0 +1,237 @@
+"""The walk from a point to the closest triangle: branch and bound through the same eight-wide hierarchy.
+
+Roussopoulos, Kelley & Vincent, "Nearest Neighbor Queries", SIGMOD 1995: children are visited by the distance
+of their boxes, and left out where that is beyond the closest triangle found.
+
+Differences:
+
+1. The stack holds nodes and the lanes not yet visited. Whenever a node is on top the distances of its boxes
+   are computed again, so that the nearest lane is taken by what is known now; nothing is sorted or kept.
+2. Distance to a triangle is the least of those to its three edges and, where the point's foot is inside, to
+   its foot (after Ericson, "Real-Time Collision Detection", 2005, section 5.1.5): each is the distance of a
+   point of the triangle, so that noise in a sliver's signs can only make it look farther than it is.
+3. Products are rounded one by one: the triangle found is the same in each residency.
+
+Cost: a turn a visit to a node or leaf, and one to leave a node. Distances are float32 in the scene's scale:
+that of the triangle found is at most 2**-20 of the largest coordinate of point and scene beyond the least,
+which the tests hold against float64.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from striptools.trace.numerics import folded, index, larger, rounded, smaller
+from striptools.trace.triangle import pick
+from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, WIDTH, Decode, Leaf, WalkScene
+
+FARTHEST = np.float32(2.0**60)
+"""The largest scaled coordinate of a point that can be looked from: squares stay finite."""
+
+VISITS_A_NODE = 1 + WIDTH
+
+Vector = tuple[Array, Array, Array]
+
+
+class Nearest(NamedTuple):
+    """The closest triangle so far: the square of its distance, its name, its leaf and its lane there."""
+
+    square: Array
+    name: Array
+    face: Array
+    leaf: Array
+    lane: Array
+
+
+class _State(NamedTuple):
+    stack: Array
+    height: Array
+    turns: Array
+    nearest: Nearest
+
+
+class PointOptions(NamedTuple):
+    """What is compiled in, as in `walk.WalkOptions`."""
+
+    stack_size: int
+    batch: bool
+    decode: Decode | None
+
+
+class Closest(NamedTuple):
+    """One entry a point: what the scene calls the triangle, and its corners a, b, c (9,), scaled, x first."""
+
+    name: Array
+    corners: Array
+
+
+def closest_triangles(scene: WalkScene, points: Array, options: PointOptions) -> Closest:
+    """Walk from r points.
+
+    Args:
+        scene: What to search.
+        points: (r, 4) float32, scaled coordinates, and 1; a row of zeros ends at once.
+        options: What to compile in.
+    """
+    floor = jnp.zeros((options.stack_size, 2), jnp.int32)
+
+    def walk(stack: Array, point: Array) -> tuple[Array, Closest]:
+        return _walk(scene, point, stack, options)
+
+    if options.batch:
+        return jax.vmap(lambda point: walk(floor, point)[1])(points)
+    return lax.scan(walk, floor, points)[1]
+
+
+def _walk(scene: WalkScene, point: Array, stack: Array, options: PointOptions) -> tuple[Array, Closest]:
+    at = (point[0], point[1], point[2])
+    size = larger(larger(jnp.abs(at[0]), jnp.abs(at[1])), larger(jnp.abs(at[2]), scene.frame.reach))
+    margin = scene.frame.margin * size
+    root = jnp.array([0, 2**WIDTH - 1], jnp.int32)
+    stack = lax.dynamic_update_slice(stack, root[None], (jnp.uint32(0), jnp.uint32(0)))
+    height = jnp.where(point[3] > 0, jnp.int32(1), jnp.int32(0))
+    none = (jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME, DONE, np.int32(0)))
+    nothing = Nearest(*none)
+
+    def goes_on(state: _State) -> Array:
+        return (state.height > 0) & (state.turns <= VISITS_A_NODE * scene.node_count)
+
+    def turn(state: _State) -> _State:
+        return _turn(scene, at, margin, state, options.decode)
+
+    state = lax.while_loop(goes_on, turn, _State(stack, height, jnp.int32(0), nothing))
+    name = jnp.where(state.height > 0, STUCK, state.nearest.name)
+    found = name >= 0
+    leaf = _leaf(scene, jnp.where(found, state.nearest.leaf, -1), options.decode)
+    held = jnp.arange(WIDTH, dtype=jnp.int32) == state.nearest.lane
+    corners = [jnp.where(held & found, lanes, 0).sum() for axis in (leaf.x, leaf.y, leaf.z) for lanes in axis]
+    return state.stack, Closest(name, jnp.stack(corners))
+
+
+def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: Decode | None) -> _State:
+    """Visit the nearest lane left of the node on top, or leave the node."""
+    top = index(state.height - 1)
+    node, lanes = lax.dynamic_slice(state.stack, (top, jnp.uint32(0)), (1, 2))[0]
+    squares = box_squares(scene.boxes_of(node), at, margin)
+    left = (lanes >> jnp.arange(WIDTH, dtype=jnp.int32) & 1 != 0) & (squares <= state.nearest.square)
+    squares = jnp.where(left, squares, jnp.float32(jnp.inf))
+    least = folded(squares, smaller)
+    order = jnp.arange(WIDTH, dtype=jnp.int32)
+    lane = folded(jnp.where(left & (squares == least), order, jnp.int32(WIDTH)), smaller)
+    some = lane < WIDTH
+    lane = jnp.where(some, lane, 0)
+    child = jnp.where(some, scene.child_of(node, index(lane)), DONE)
+    rest = jnp.stack([node, lanes ^ jnp.where(some, jnp.int32(1) << lane, 0)])
+    stack = lax.dynamic_update_slice(state.stack, rest[None], (top, jnp.uint32(0)))
+    below = jnp.stack([child, jnp.int32(2**WIDTH - 1)])
+    height = state.height + jnp.where(some, jnp.where(child >= 0, 1, 0), -1)
+    # Where there is no child that is a node this writes above the stack's top, where nothing is.
+    above = index(jnp.where(child >= 0, state.height, len(stack) - 1))
+    stack = lax.dynamic_update_slice(stack, below[None], (above, jnp.uint32(0)))
+    at_leaf = (child < 0) & (child != DONE)
+    nearest = lax.cond(
+        at_leaf, lambda: _visit_leaf(scene, at, child, state.nearest, decode), lambda: state.nearest
+    )
+    return _State(stack, height, state.turns + 1, nearest)
+
+
+def box_squares(boxes: Array, at: Vector, margin: Array) -> Array:
+    """(8,) float32: squares of the distances from a point to boxes (6, 8), at most the true ones."""
+    total = jnp.zeros(boxes.shape[1:], jnp.float32)
+    for axis in range(3):
+        outside = larger(boxes[axis] - at[axis], at[axis] - boxes[axis + 3]) - margin
+        # Not smaller or larger: NaN, of an empty lane, must stay.
+        outside = jnp.where(outside < 0, jnp.float32(0), outside)
+        total = total + outside * outside
+    return jnp.where(jnp.isnan(boxes[0]), jnp.float32(jnp.nan), total * np.float32(1 - 2.0**-21))
+
+
+def _leaf(scene: WalkScene, child: Array, decode: Decode | None) -> Leaf:
+    axes = (jnp.uint32(0), jnp.uint32(1), jnp.uint32(2))
+    return scene.leaf_of(axes, child, decode)
+
+
+def _corners_from(leaf: Leaf, at: Vector) -> tuple[Vector, Vector, Vector]:
+    """The corners as seen from a point, in the canonical order, each coordinate (8,)."""
+    seen = [
+        [corner - origin for corner in axis]
+        for axis, origin in zip((leaf.x, leaf.y, leaf.z), at, strict=True)
+    ]
+    if leaf.turn is not None:
+        seen = [[pick((x[j], x[(j + 1) % 3], x[(j + 2) % 3]), leaf.turn) for j in range(3)] for x in seen]
+    a, b, c = ((seen[0][j], seen[1][j], seen[2][j]) for j in range(3))
+    return a, b, c
+
+
+def triangle_squares(a: Vector, b: Vector, c: Vector) -> Array:
+    """(8,) float32: squares of the distances from zero to triangles (difference 2); NaN in empty lanes."""
+    ab, bc, ca = _minus(b, a), _minus(c, b), _minus(a, c)
+    sides = [_side_square(a, ab), _side_square(b, bc), _side_square(c, ca)]
+    normal = _cross(ab, ca)
+    weights = [_dot(_cross(p, q), normal) for p, q in ((c, b), (a, c), (b, a))]
+    whole = weights[0] + weights[1] + weights[2]
+    inside = (weights[0] >= 0) & (weights[1] >= 0) & (weights[2] >= 0) & (whole > 0)
+    shares = [weight / jnp.where(inside, whole, 1) for weight in weights]
+    foot = [
+        rounded(shares[0] * x) + rounded(shares[1] * y) + rounded(shares[2] * z)
+        for x, y, z in zip(a, b, c, strict=True)
+    ]
+    over = jnp.where(
+        inside, rounded(foot[0] * foot[0]) + rounded(foot[1] * foot[1]) + rounded(foot[2] * foot[2]), jnp.inf
+    )
+    return smaller(over, smaller(sides[0], smaller(sides[1], sides[2])))
+
+
+def _side_square(start: Vector, way: Vector) -> Array:
+    """The square of the distance from zero to the line from `start` by `way`."""
+    length = _dot(way, way)
+    share = -_dot(start, way) / jnp.where(length > 0, length, 1)
+    share = jnp.where(share > 0, jnp.where(share < 1, share, 1), 0)
+    x, y, z = (p + rounded(share * q) for p, q in zip(start, way, strict=True))
+    # Nothing that is not a number is lost: empty lanes show.
+    return rounded(x * x) + rounded(y * y) + rounded(z * z) + (start[0] - start[0])
+
+
+def _minus(p: Vector, q: Vector) -> Vector:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2]
+
+
+def _dot(p: Vector, q: Vector) -> Array:
+    return rounded(p[0] * q[0]) + rounded(p[1] * q[1]) + rounded(p[2] * q[2])
+
+
+def _cross(p: Vector, q: Vector) -> Vector:
+    return (
+        rounded(p[1] * q[2]) - rounded(p[2] * q[1]),
+        rounded(p[2] * q[0]) - rounded(p[0] * q[2]),
+        rounded(p[0] * q[1]) - rounded(p[1] * q[0]),
+    )
+
+
+def _visit_leaf(
+    scene: WalkScene, at: Vector, child: Array, nearest: Nearest, decode: Decode | None
+) -> Nearest:
+    """The closest triangle with those of a leaf; of equals, that of the least face."""
+    leaf = _leaf(scene, child, decode)
+    a, b, c = _corners_from(leaf, at)
+    squares = triangle_squares(a, b, c)
+    if leaf.filled is not None:
+        squares = jnp.where(leaf.filled, squares, jnp.float32(jnp.nan))
+    squares = lax.optimization_barrier(squares)
+    within = squares <= nearest.square
+    squares = jnp.where(within, squares, jnp.float32(jnp.inf))
+    least = folded(squares, smaller)
+    faces = scene.faces_of(leaf.name)
+    face = folded(jnp.where(within & (squares == least), faces, NO_NAME), smaller)
+    lane = folded(
+        jnp.where(within & (squares == least) & (faces == face), jnp.arange(WIDTH, dtype=jnp.int32), WIDTH),
+        smaller,
+    )
+    closer = (lane < WIDTH) & ((least < nearest.square) | (face < nearest.face))
+    held = jnp.arange(WIDTH, dtype=jnp.int32) == lane
+    name = folded(jnp.where(held, leaf.name, NO_NAME), smaller)
+    new = Nearest(least, name, face, child, lane)
+    return Nearest(*(jnp.where(closer, mine, old) for mine, old in zip(new, nearest, strict=True)))
