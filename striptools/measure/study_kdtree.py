@@ -279,7 +279,7 @@ def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int
 
 
 # Notes. Change by the correction in percent, primary / secondary rays of 512 x 512, a mail-box of 8, one
-# thread; "without" is that of tests without a mail-box. The forest is 12 trees, 4 of them maples, from outside.
+# thread; "without" is that of tests without a mail-box. The forest is 12 trees, 4 of them maples.
 #
 #     mesh                triangles: tests, steps, time, without           strips: the same
 #     tree_japanesemaple  -24 / -24  +2.1 / +2.1  -1 / +0  -21 / -21    -33 / -32  +9.5 / +11   -6 / -2   -18
