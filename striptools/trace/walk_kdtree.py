@@ -329,5 +329,5 @@ def _float(bits: Array) -> Array:
 # default walk 3,960 / 2,340, this one 2,070 / 990 without a mail-box, 2,060 / 965 with one of 8. A ray takes
 # 25 / 44 steps of 15 to 20 ns here where the default one takes 6.5 / 9.7; a step waits for its node.
 # Tried and nothing gained: the stack as three arrays of one column, the axis of the slab by selects, a node
-# read at once. A mail-box costs 1 to 4 % over triangles, where few tests are saved, and gives 3 to 20 % over
-# strips (tree_japanesemaple; 4 entries do as well as 8).
+# read at once. A mail-box costs 0 to 6 % of the time over triangles, where few tests are saved, and gives up
+# to 17 % over strips (bunny); 4 entries do as well as 8.
