@@ -48,6 +48,7 @@ from striptools.trace.walk import (
     replaced,
     walk_rays,
 )
+from striptools.trace.walk_packets import walk_packets
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
@@ -127,6 +128,38 @@ class PackedScene(NamedTuple):
         cells = origins[:, None] + (planes.reshape(2, 3, LANES).astype(jnp.uint32) << shifts[:, None])
         boxes = _number(cells) * self.frame.unit[:, None] + self.frame.low[:, None]
         return jnp.where(planes[0] <= planes[3], boxes.reshape(6, LANES), jnp.float32(jnp.nan))
+
+    def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
+        """Sides of a node's boxes, scaled and rounded; not a number where there is none."""
+        head = self._head(node)
+        planes = [self._planes(node, row, jnp.uint32(0), LANES) for row in rows]
+        sides = [self._side(head, row, each) for row, each in zip(rows, planes, strict=True)]
+        sides[0] = jnp.where(planes[0] <= planes[1], sides[0], jnp.float32(jnp.nan))
+        return sides
+
+    def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
+        """Sides of the box in one lane."""
+        head = self._head(node)
+        return [self._side(head, row, self._planes(node, row, lane, 1)[0]) for row in rows]
+
+    def _head(self, node: Array) -> Array:
+        return lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
+
+    def _planes(self, node: Array, row: Array, lane: Array, count: int) -> Array:
+        at = (index(node), jnp.uint32(16) + LANES * row + lane)
+        return lax.dynamic_slice(self.planes, at, (1, count))[0].astype(jnp.int32)
+
+    def _side(self, head: Array, row: Array, planes: Array) -> Array:
+        """Where planes in one of the six rows lie, scaled."""
+        axis = jnp.where(row >= 3, row - 3, row)
+        origin = pick((head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF), axis).astype(jnp.int32)
+        shift = pick((head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28), axis).astype(jnp.int32)
+        cells = (origin + (planes << shift)).astype(jnp.float32)
+        return cells * pick(self.frame.unit, axis) + pick(self.frame.low, axis)
+
+    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+        """Walk packets made ready."""
+        return walk_packets(self, ready, options)
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
