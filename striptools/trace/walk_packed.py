@@ -177,6 +177,26 @@ class PackedScene(NamedTuple):
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a run, decoded, their corners along these axes."""
+        x, y, z, filled, name = self._decoded(child, decode)
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
+
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The same, decoded once: behind a cond, or XLA decodes it anew for every use and for every axis."""
+        shape = jnp.zeros(LANES)
+        nothing = ([shape] * 3,) * 3
+        x, y, z, filled, name = lax.cond(
+            child < 0,
+            lambda: self._decoded(child, decode),
+            lambda: (*nothing, jnp.zeros(LANES, jnp.bool_), jnp.zeros(LANES, jnp.int32)),
+        )
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
+
+    def _decoded(
+        self, child: Array, decode: Decode | None
+    ) -> tuple[list[Array], list[Array], list[Array], Array, Array]:
+        """Coordinates x, y, z of corners a, b, c, which lanes hold a triangle, and their names."""
         assert decode is not None
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = lax.optimization_barrier(self._run_of(child))
@@ -184,10 +204,8 @@ class PackedScene(NamedTuple):
         lane = jnp.arange(LANES, dtype=jnp.uint32)
         corners = self._corners(header, run, decode.flips)
         x, y, z = self._positions(header, corners, decode)
-        turn = _first_corner(x, y, z)
-        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
-        return Leaf(ax, ay, az, turn, lane <= (run >> 8 & 7), name)
+        return x, y, z, lane <= (run >> 8 & 7), name
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""

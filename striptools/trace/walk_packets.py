@@ -38,6 +38,7 @@ from striptools.trace.walk import (
     SLACK,
     STUCK,
     WIDTH,
+    Decode,
     Leaf,
     Place,
     Traced,
@@ -66,6 +67,10 @@ class PacketScene(WalkScene, Protocol):
 
     def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
         """Sides of the box in one lane, () float32 each, as of `sides_of`."""
+        ...
+
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """`leaf_of` for one leaf and many rays."""
         ...
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
@@ -383,7 +388,7 @@ def _walk_packet(
 
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
         place = state.place
-        leaf = scene.leaf_of(packet.axes, place.child, options.decode)
+        leaf = scene.leaf_for_packets(packet.axes, place.child, options.decode)
         sifted = _sifted(packet, leaf, _box_of(scene, packet, place), found)
         found = _test_leaf(scene, packet, sifted, found, options)
         there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)

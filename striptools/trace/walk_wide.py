@@ -66,6 +66,10 @@ class WideScene(NamedTuple):
         leaf = index(-(child + 1))
         return Leaf(*corners_in(self.blocks, leaf, axes), None, None, faces_in(self.blocks, leaf))
 
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The same: nothing is decoded."""
+        return self.leaf_of(axes, child, decode)
+
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""
         at = index(node)
