@@ -36,7 +36,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
-from striptools.trace.numerics import folded, index
+from striptools.trace.numerics import BY_XLA, Arithmetic, folded, index
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, pick
 from striptools.trace.walk import DONE, Best, Decode, Frame, WalkOptions, replaced
 
@@ -91,9 +91,8 @@ class PackedScene(NamedTuple):
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         at = index(node)
-        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
-        planes = planes.astype(jnp.int32).astype(jnp.float32)
-        head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
+        planes = self._planes_of(at)
+        head = self._row(self.nodes, at, 4)
         origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
         shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
         low, high = [], []
@@ -102,12 +101,12 @@ class PackedScene(NamedTuple):
             step = slab.inverse[axis] * _power_of_two(shifts[axis].astype(jnp.int32))
             low.append(planes[axis] * step + (start - slab.low[axis]))
             high.append(planes[axis + 3] * step + (start - slab.high[axis]))
-        return passes(low, high, limit) & (planes[0] <= planes[3])
+        return self._passes(low, high, limit) & (planes[0] <= planes[3])
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
-        head = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
-        bit = jnp.uint32(1) << (lane & 7)
+        head = self._row(self.nodes, index(node), 4)
+        bit = np.uint32(1) << (lane & 7)
         inner, leaves = head[3] >> 16 & 0xFF, head[1] >> 24
         below = bit - 1
         as_node = (head[0] & 0xFFFFFFF) + lax.population_count(inner & below)
@@ -121,20 +120,26 @@ class PackedScene(NamedTuple):
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""
         assert options.decode is not None
-        # Behind barriers, or XLA finds the run anew for every use of it.
-        block, run = lax.optimization_barrier(self._run_of(child))
-        header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
-        first = header[0] + (run & 0xFF)
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
-        corners = self._corners(header, run, options.decode.flips)
-        x, y, z = self._positions(header, corners, options.decode)
-        turn = _first_corner(x, y, z)
-        ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
-        t = crossing_of(edges_of(ax, ay, az, shear), turn)
-        t = jnp.where(lane <= (run >> 8 & 7), t, jnp.float32(0))
-        triangle = (first + lane).astype(jnp.int32)
+        t, triangle = self.crossings(shear, child, options.decode, BY_XLA)
         found = _any((t > 0) & (t <= best.t))
         return lax.cond(found, lambda: self._merged(best, t, triangle, options.any_hit), lambda: best)
+
+    def crossings(
+        self, shear: Shear, child: Array, decode: Decode, arithmetic: Arithmetic
+    ) -> tuple[Array, Array]:
+        """(8,) each: where the ray's line goes through the triangles of a run, as `crossing_of`, and these."""
+        # Behind barriers, or XLA finds the run anew for every use of it.
+        block, run = self._settled(self._run_of(child))
+        header = self._settled(self._row(self.headers, block, 8))
+        first = header[0] + (run & 0xFF)
+        lane = self._lanes()
+        corners = self._corners(header, run, decode.flips)
+        x, y, z = self._positions(header, corners, decode)
+        turn = _first_corner(x, y, z)
+        ax, ay, az = (_along(x, y, z, axis) for axis in shear.axes)
+        t = crossing_of(edges_of(ax, ay, az, shear, arithmetic), turn, arithmetic)
+        t = jnp.where(lane <= (run >> 8 & 7), t, np.float32(0))
+        return t, (first + lane).astype(jnp.int32)
 
     def _merged(self, best: Best, t: Array, triangle: Array, any_hit: bool) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
@@ -152,42 +157,78 @@ class PackedScene(NamedTuple):
         """The faces of triangles; a name that is none keeps its number."""
         if not self.has_faces:
             return names
-        return jnp.where(names < 0, names, _at(self.faces, index(names)))
+        return jnp.where(names < 0, names, self._at(self.faces, index(names)))
+
+    # What follows says how arrays are read; the walk on a GPU reads them in its own way.
+
+    def _lanes(self) -> Array:
+        """The number of each lane, uint32."""
+        return jnp.arange(LANES, dtype=jnp.uint32)
+
+    def _at(self, values: Array, places: Array) -> Array:
+        """Values at places that are known to be inside."""
+        return values.at[places].get(mode="promise_in_bounds")
+
+    def _row(self, rows: Array, row: Array, count: int) -> Any:
+        """The first `count` values of a row."""
+        return lax.dynamic_slice(rows, (row, jnp.uint32(0)), (1, count))[0]
+
+    def _planes_of(self, node: Array) -> Any:
+        """(6, 8) float32: the lanes' planes on each axis, low and high."""
+        planes = lax.dynamic_slice(self.planes, (node, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        return planes.astype(jnp.int32).astype(jnp.float32)
+
+    def _words_at(self, places: Array, count: int) -> list[Array]:
+        """Words at places, at the places behind them, and so on: one gather, cheaper than several."""
+        dimensions = lax.GatherDimensionNumbers(
+            offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,)
+        )
+        inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+        rows = lax.gather(self.words, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
+        return [rows[k] for k in range(count)]
+
+    def _settled(self, values: Any) -> Any:
+        """Values that are not computed again for each use."""
+        return lax.optimization_barrier(values)
+
+    def _passes(self, low: list[Array], high: list[Array], limit: Array) -> Array:
+        """As `box.passes`."""
+        return passes(low, high, limit)
 
     def _run_of(self, child: Array) -> tuple[Array, Array]:
         """The block of a leaf, and what is said of its run."""
         code = index(~child)
         node, slot = code >> 3, code & 7
-        record = lax.dynamic_slice(self.nodes, (node, jnp.uint32(0)), (1, 16))[0]
-        inner, below = record[3] >> 16 & 0xFF, (jnp.uint32(1) << slot) - 1
+        record = self._row(self.nodes, node, 16)
+        inner, below = record[3] >> 16 & 0xFF, (np.uint32(1) << slot) - 1
         bits = 8 * (slot & 3)
-        under = (jnp.uint32(1) << bits) - 1
+        under = (np.uint32(1) << bits) - 1
         first = _used_bytes(record[4], record[10]) & jnp.where(slot < 4, under, ALL)
         second = _used_bytes(record[5], record[11]) & jnp.where(slot < 4, 0, under)
         rank = lax.population_count(first | second >> 1) - lax.population_count(inner & below)
         block = record[1] & BLOCK_BITS
-        return block, _at(self.runs, _at(self.first_run, block) + (record[1] >> 24) + rank)
+        return block, self._at(self.runs, self._at(self.first_run, block) + (record[1] >> 24) + rank)
 
     def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
         word, counts = header[1], header[2]
         triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
+        lane = self._lanes()
         first = run & 0xFF
         place = first + 2 * (run >> 11 & 0xFF) + 1
 
         # The far corner is what the last other turn left behind.
         turns = run >> 19 & 0xFF
         turned = (turns >> lane & 1) != 0
-        other = jnp.where(turned, ~turns, turns) & ((jnp.uint32(2) << lane) - 1)
+        other = jnp.where(turned, ~turns, turns) & ((np.uint32(2) << lane) - 1)
         last = 31 - lax.clz(other)
 
         width = 32 - lax.clz(counts >> 8 & 0xFF)
-        mask = (jnp.uint32(1) << width) - 1
+        mask = (np.uint32(1) << width) - 1
         indices = (2 + has_flips) * triangles
         near = self._windows(word, indices + place * width, width * lane)
         far = self._windows(word, indices + place * width, width * jnp.where(other == 0, 0, last))
-        before = self._windows(word, indices + (place - (run >> 27)) * width, jnp.uint32(0), 2)
+        before = self._windows(word, indices + (place - (run >> 27)) * width, np.uint32(0), 2)
         far = jnp.where(other == 0, before, far) & mask
         if flips:
             flipped = self._windows(word, 2 * triangles + first, lane, 3) & has_flips
@@ -198,7 +239,7 @@ class PackedScene(NamedTuple):
     def _windows(self, word: Array, bit: Array, further: Array, count: int = 4) -> Array:
         """Uint32: 32 bits of a stream from `bit` plus each of `further` on, all of them in `count` words."""
         at = word + (bit >> 5)
-        loaded = [_at(self.words, at + k) for k in range(count)]
+        loaded = [self._at(self.words, at + k) for k in range(count)]
         bits = (bit & 31) + further
         place, shift = bits >> 5, bits & 31
         lower, upper = loaded[0], loaded[1]
@@ -223,7 +264,7 @@ class PackedScene(NamedTuple):
         for corner in corners:
             bit = vertices + corner * stride
             shift = bit & 31
-            loaded = [*_rows_at(self.words, header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
+            loaded = [*self._words_at(header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
             vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
         return [[vertex[axis] for vertex in found] for axis in range(3)]
@@ -245,7 +286,7 @@ def _axes(header: Array, scale_exponent: Array) -> list[_Axis]:
     described = header[6], header[6] >> 8, header[6] >> 16
     exponents = header[6] >> 24, header[7] & 0xFF, header[7] >> 8 & 0xFF
     axes = []
-    offset = jnp.uint32(0)
+    offset = np.uint32(0)
     for axis in range(3):
         width, mode = described[axis] & 63, described[axis] >> 6 & 3
         exponent = exponents[axis].astype(jnp.int32) - 149 + scale_exponent
@@ -261,12 +302,12 @@ def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
     lower, upper = padded[0], padded[1]
     for k in range(1, min(3, len(vertex))):
         lower, upper = jnp.where(place == k, padded[k], lower), jnp.where(place == k, padded[k + 1], upper)
-    mask = jnp.where(axis.width == 0, jnp.uint32(0), jnp.uint32(0xFFFFFFFF) >> (32 - axis.width & 31))
+    mask = jnp.where(axis.width == 0, np.uint32(0), ALL >> (32 - axis.width & 31))
     number = (lower >> shift | upper << 1 << (31 - shift)) & mask
     whole = (axis.anchor + number).astype(jnp.int32)
     value = whole.astype(jnp.float32)
     if decode.minus_zero:
-        value = jnp.where((axis.mode == 1) & (number == mask), jnp.float32(0), value)
+        value = jnp.where((axis.mode == 1) & (number == mask), np.float32(0), value)
     if decode.tiny:
         value = _scaled(value, axis.exponent)
         return jnp.where(axis.mode == 2, _from_bits(whole, axis.scale_exponent), value)
@@ -292,7 +333,7 @@ def _scaled(number: Array, exponent: Array) -> Array:
     """A number times a power of two, in two steps since one may be out of range; zero where denormal."""
     first = jnp.clip(exponent, -126, 127)
     value = number * _power_of_two(first) * _power_of_two(jnp.clip(exponent - first, -126, 127))
-    return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, jnp.float32(0), value)
+    return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, np.float32(0), value)
 
 
 def _along(x: list[Array], y: list[Array], z: list[Array], axis: Array) -> Corners:
@@ -314,7 +355,7 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
 
 def _any(flags: Array) -> Array:
     """Whether any lane's flag is set."""
-    return folded(jnp.where(flags, jnp.int32(1), jnp.int32(0)), jnp.bitwise_or) != 0
+    return folded(jnp.where(flags, np.int32(1), np.int32(0)), jnp.bitwise_or) != 0
 
 
 def _number(a: Array) -> Array:
@@ -327,23 +368,10 @@ def _power_of_two(exponent: Array) -> Array:
     return lax.bitcast_convert_type((exponent + 127) << 23, jnp.float32)
 
 
-def _at(values: Array, places: Array) -> Array:
-    """Values at places that are known to be inside."""
-    return values.at[places].get(mode="promise_in_bounds")
-
-
-def _rows_at(values: Array, places: Array, count: int) -> list[Array]:
-    """Values at places, at the places behind them, and so on: one gather, which is cheaper than several."""
-    dimensions = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,))
-    inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    rows = lax.gather(values, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
-    return [rows[k] for k in range(count)]
-
-
 def _used_bytes(low: Array, high: Array) -> Array:
     """The top bit of each byte but of those where low is 1 and high is 0: four slots that are not empty."""
     other = (low ^ 0x01010101) | high
-    return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & jnp.uint32(0x80808080)
+    return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & np.uint32(0x80808080)
 
 
 def _at_bottom(node: Array, count: int) -> Array:
