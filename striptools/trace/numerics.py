@@ -59,6 +59,7 @@ class Arithmetic(NamedTuple):
         smaller: Of two that compare.
         larger: Of two that compare.
         settled: A value that is not computed again for each use.
+        ones: How many bits of a uint32 are set.
     """
 
     product: Callable[[Array, Array], Array]
@@ -66,9 +67,17 @@ class Arithmetic(NamedTuple):
     smaller: Callable[[Array, Array], Array]
     larger: Callable[[Array, Array], Array]
     settled: Callable[[Array], Array]
+    ones: Callable[[Array], Array]
 
 
-BY_XLA = Arithmetic(lambda a, b: rounded(a * b), quotient, smaller, larger, lax.optimization_barrier)
+BY_XLA = Arithmetic(
+    lambda a, b: rounded(a * b),
+    quotient,
+    smaller,
+    larger,
+    lax.optimization_barrier,
+    lax.population_count,
+)
 
 
 def with_sign_of(a: Array, sign_bit: Array) -> Array:

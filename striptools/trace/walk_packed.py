@@ -109,8 +109,8 @@ class PackedScene(NamedTuple):
         bit = np.uint32(1) << (lane & 7)
         inner, leaves = head[3] >> 16 & 0xFF, head[1] >> 24
         below = bit - 1
-        as_node = (head[0] & 0xFFFFFFF) + lax.population_count(inner & below)
-        as_block = self.top_count + (head[1] & BLOCK_BITS) + lax.population_count(leaves & below)
+        as_node = (head[0] & 0xFFFFFFF) + self._ones(inner & below)
+        as_block = self.top_count + (head[1] & BLOCK_BITS) + self._ones(leaves & below)
         as_run = ~(index(node) << 3 | (lane & 7))
         child = jnp.where(index(node) < self.top_count, as_block, as_run)
         child = jnp.where((inner & bit) != 0, as_node, child).astype(jnp.int32)
@@ -191,6 +191,10 @@ class PackedScene(NamedTuple):
         """Values that are not computed again for each use."""
         return lax.optimization_barrier(values)
 
+    def _ones(self, values: Array) -> Array:
+        """How many bits are set."""
+        return lax.population_count(values)
+
     def _passes(self, low: list[Array], high: list[Array], limit: Array) -> Array:
         """As `box.passes`."""
         return passes(low, high, limit)
@@ -205,7 +209,7 @@ class PackedScene(NamedTuple):
         under = (np.uint32(1) << bits) - 1
         first = _used_bytes(record[4], record[10]) & jnp.where(slot < 4, under, ALL)
         second = _used_bytes(record[5], record[11]) & jnp.where(slot < 4, 0, under)
-        rank = lax.population_count(first | second >> 1) - lax.population_count(inner & below)
+        rank = self._ones(first | second >> 1) - self._ones(inner & below)
         block = record[1] & BLOCK_BITS
         return block, self._at(self.runs, self._at(self.first_run, block) + (record[1] >> 24) + rank)
 
@@ -221,9 +225,9 @@ class PackedScene(NamedTuple):
         turns = run >> 19 & 0xFF
         turned = (turns >> lane & 1) != 0
         other = jnp.where(turned, ~turns, turns) & ((np.uint32(2) << lane) - 1)
-        last = 31 - lax.clz(other)
+        last = 31 - _leading_zeros(other)
 
-        width = 32 - lax.clz(counts >> 8 & 0xFF)
+        width = 32 - _leading_zeros(counts >> 8 & 0xFF)
         mask = (np.uint32(1) << width) - 1
         indices = (2 + has_flips) * triangles
         near = self._windows(word, indices + place * width, width * lane)
@@ -256,7 +260,7 @@ class PackedScene(NamedTuple):
         """Scaled coordinates x, y, z of the corners, (8,) float32 each."""
         counts = header[2]
         triangles, strips, has_flips = (counts & 0xFF) + 1, (counts >> 16 & 0xFF) + 1, counts >> 24 & 1
-        index_width = 32 - lax.clz(counts >> 8 & 0xFF)
+        index_width = 32 - _leading_zeros(counts >> 8 & 0xFF)
         vertices = (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
         axes = _axes(header, self.scale_exponent)
         stride = axes[0].width + axes[1].width + axes[2].width
@@ -361,6 +365,11 @@ def _any(flags: Array) -> Array:
 def _number(a: Array) -> Array:
     """A small unsigned integer as float32, by way of int32: one instruction."""
     return a.astype(jnp.int32).astype(jnp.float32)
+
+
+def _leading_zeros(a: Array) -> Array:
+    """Of uint32, by way of int32: Triton counts those of no others."""
+    return lax.clz(a.astype(jnp.int32)).astype(jnp.uint32)
 
 
 def _power_of_two(exponent: Array) -> Array:

@@ -5,6 +5,7 @@ is left alone. Denormals are flushed as XLA flushes them on a CPU.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,19 +21,32 @@ _PRODUCT = "{ .reg .f32 p; mul.rn.ftz.f32 p, $1, $2; max.ftz.f32 $0, p, 0fFF7FFF
 _QUOTIENT = "div.rn.ftz.f32 $0, $1, $2;"
 
 
-def _instruction(assembly: str) -> Callable[[Array, Array], Array]:
-    """A function of two float32 arrays of one shape."""
+_ONES = "popc.b32 $0, $1;"
+"""Triton has no such operation of its own."""
 
-    def run(a: Array, b: Array) -> Array:
-        shape = jnp.broadcast_shapes(jnp.shape(a), jnp.shape(b))
-        result = jax.ShapeDtypeStruct(shape, np.float32)
-        given = [jnp.broadcast_to(a, shape), jnp.broadcast_to(b, shape)]
+
+def _instruction(assembly: str, kind: Any, constraint: str) -> Callable[..., Array]:
+    """A function of arrays, of one kind and of shapes that broadcast."""
+
+    def run(*given: Array) -> Array:
+        shape = jnp.broadcast_shapes(*map(jnp.shape, given))
         return plgpu.elementwise_inline_asm(
-            assembly, args=given, constraints="=f,f,f", pack=1, result_shape_dtypes=[result]
+            assembly,
+            args=[jnp.broadcast_to(a, shape) for a in given],
+            constraints=",".join([f"={constraint}", *[constraint] * len(given)]),
+            pack=1,
+            result_shape_dtypes=[jax.ShapeDtypeStruct(shape, kind)],
         )[0]
 
     return run
 
 
-BY_TRITON = Arithmetic(_instruction(_PRODUCT), _instruction(_QUOTIENT), lax.min, lax.max, lambda a: a)
-"""Of two numbers; where one is not a number, the smaller and the larger are the other."""
+BY_TRITON = Arithmetic(
+    _instruction(_PRODUCT, np.float32, "f"),
+    _instruction(_QUOTIENT, np.float32, "f"),
+    lax.min,
+    lax.max,
+    lambda a: a,
+    lambda a: _instruction(_ONES, np.int32, "r")(a).astype(np.uint32),
+)
+"""Of a number and what is none, the smaller and the larger are the number."""

@@ -176,6 +176,9 @@ class PackedTile(PackedScene):
     def _settled(self, values: Any) -> Any:
         return jax.tree.map(self.arithmetic.settled, values)
 
+    def _ones(self, values: Array) -> Array:
+        return self.arithmetic.ones(values)
+
     def _passes(self, low: list[Array], high: list[Array], limit: Array) -> Array:
         return passes(low, high, limit)
 
