@@ -1,5 +1,6 @@
 """Programs for a set of devices, and rays streamed through them in tiles of a few fixed sizes."""
 
+import warnings
 from collections import deque
 from collections.abc import Iterator
 from functools import lru_cache, partial
@@ -10,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from striptools.kernels.rays import ROW, ready_rays
-from striptools.trace.device import quiet_jax
+from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout
 from striptools.trace.leaves import Rays, aligned_full
 from striptools.trace.walk import WalkOptions, WalkScene, trace_rays, walk_rays
@@ -27,6 +28,9 @@ rays."""
 
 READY_IN_FLIGHT = 2
 """The same of CPU devices: more only push each other's rays out of the cache."""
+
+_refused: set[WalkOptions] = set()
+"""Options with which the kernel could not be compiled in this process."""
 
 _RAYS = PartitionSpec("device")
 _EVERYWHERE = PartitionSpec()
@@ -49,7 +53,7 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
 
     Rays are (origins, directions, t_max) where all are walked at once, else ready ones.
     """
-    walk, arrays = (trace_rays, 3) if options.batch else (walk_rays, 1)
+    walk, arrays = _walk_of(options)
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
@@ -60,17 +64,44 @@ def program(mesh: Mesh, options: WalkOptions) -> Any:
     return jax.jit(split)
 
 
+def _walk_of(options: WalkOptions) -> tuple[Any, int]:
+    """What walks rays, and how many arrays they are."""
+    if options.kernel:
+        # Here, so that a JAX without Pallas or its Triton does for all else.
+        from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
+
+        return trace_by_kernel, 3
+    return (trace_rays, 3) if options.batch else (walk_rays, 1)
+
+
+def _started(scene: WalkScene, rays: list[Any], mesh: Mesh, options: WalkOptions) -> Any:
+    """Start a tile; where the kernel cannot be compiled, say so once, and let its twin walk."""
+    if options.kernel and options not in _refused:
+        try:
+            return program(mesh, options)(scene, *rays)
+        except Exception as error:
+            # Pallas, Triton and XLA raise as they please; of what else is wrong the twin will tell.
+            _refused.add(options)
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            warnings.warn(
+                f"the GPU kernel cannot be compiled here; rays are walked many times slower: {reason}",
+                SlowTracingWarning,
+                stacklevel=2,
+            )
+    return program(mesh, options._replace(kernel=False))(scene, *rays)
+
+
 def stream(
     scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
     """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
-    compiled = program(mesh, options)
     split = NamedSharding(mesh, _RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
     for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
-            waiting.append((part, per_device, compiled(scene, *jax.device_put(padded, split))))
+            on_device = jax.device_put(padded, split)
+            waiting.append((part, per_device, _started(scene, on_device, mesh, options)))
         if len(waiting) >= IN_FLIGHT:
             yield _collect(*waiting.popleft(), mesh.size)
     while waiting:

@@ -78,7 +78,7 @@ class Tracer:
         _check_kinds(hierarchy, resident)
         devices = trace_devices(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
-        self._on_gpu = devices[0].platform != "cpu"
+        self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
         if scene.instances is not None:
             resident, hierarchy = _of_instances(resident), "rebuilt"
@@ -192,7 +192,8 @@ class Tracer:
     def _options(self, *, any_hit: bool, steps: bool) -> WalkOptions:
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, self._on_gpu, decode)
+        gpu, kernel = self._on_gpu, self._on_gpu and self._kernel
+        return WalkOptions(side_by_side, any_hit, steps, self._stack_size, gpu, decode, kernel)
 
 
 def _check_kinds(hierarchy: str, resident: str) -> None:

@@ -121,6 +121,7 @@ class WalkOptions(NamedTuple):
         stack_size: Entries of the stack: the depth of the tree and two more.
         batch: Walk all rays at once by vmap (GPU), not one group after the other (CPU).
         decode: How leaves are decoded, where they are packed.
+        kernel: Walk by the GPU kernel of `trace.pallas`, whose twin `batch` is.
     """
 
     interleave: int
@@ -129,6 +130,7 @@ class WalkOptions(NamedTuple):
     stack_size: int
     batch: bool = False
     decode: "Decode | None" = None
+    kernel: bool = False
 
 
 class Decode(NamedTuple):

@@ -127,7 +127,7 @@ class PackedScene(NamedTuple):
     def crossings(
         self, shear: Shear, child: Array, decode: Decode, arithmetic: Arithmetic
     ) -> tuple[Array, Array]:
-        """(8,) each: where the ray's line goes through the triangles of a run, as `crossing_of`, and these."""
+        """(8,) each: where the ray's line goes through the triangles of a run (`crossing_of`), and these."""
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = self._settled(self._run_of(child))
         header = self._settled(self._row(self.headers, block, 8))

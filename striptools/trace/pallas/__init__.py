@@ -1,1 +1,1 @@
-"""Kernels for GPUs, in Pallas. Each has a twin in plain JAX, which runs everywhere and gives the same hits."""
+"""Kernels for GPUs, in Pallas. Each has a twin in plain JAX that runs everywhere, with the same hits."""

@@ -1,7 +1,7 @@
 """Scenes as a kernel sees them: what a tile of a few rays by eight lanes reads of nodes and leaves.
 
-Every value is a tile (rays, 8): a lane is a child of the ray's node or a triangle of its leaf, and what is one
-for a ray stands in all its lanes. A row of a node or leaf is then read by neighbouring threads.
+Every value is a tile (rays, 8): a lane is a child of the ray's node or a triangle of its leaf, and what a ray
+has but one of stands in all its lanes. A row of a node or leaf is then read by neighbouring threads.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class Tile(Protocol):
         ...
 
     def crossings_in(self, shear: Shear, child: Array, options: WalkOptions) -> tuple[Array, Array]:
-        """Where rays' lines go through the triangles of leaves, as `triangle.crossing_of`, and their names."""
+        """Where rays' lines go through triangles of leaves, as `triangle.crossing_of`, and their names."""
         ...
 
     def faces_of(self, names: Array) -> Array:
@@ -123,7 +123,16 @@ class WideTile(NamedTuple):
 def _packed_arrays(scene: PackedScene) -> list[Any]:
     """All but the frame; a single number is an array of one."""
     single = [jnp.reshape(a, 1) for a in (scene.top_count, scene.scale_exponent)]
-    return [*single, scene.nodes, scene.planes, scene.headers, scene.words, scene.first_run, scene.runs, scene.faces]
+    return [
+        *single,
+        scene.nodes,
+        scene.planes,
+        scene.headers,
+        scene.words,
+        scene.first_run,
+        scene.runs,
+        scene.faces,
+    ]
 
 
 class PackedTile(PackedScene):

@@ -23,12 +23,24 @@ from jax import Array, lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
+from striptools.trace.box import Slab
 from striptools.trace.numerics import BY_XLA, Arithmetic
 from striptools.trace.pallas.arithmetic import BY_TRITON
 from striptools.trace.pallas.tiles import Source, Tile, lane_numbers, source_of
 from striptools.trace.triangle import Shear
-from striptools.trace.box import Slab
-from striptools.trace.walk import DONE, FLOATS, MISS, NO_NAME, SLACK, STUCK, WIDTH, Traced, WalkOptions, WalkScene
+from striptools.trace.walk import (
+    DONE,
+    FLOATS,
+    MISS,
+    NO_NAME,
+    SLACK,
+    STUCK,
+    WIDTH,
+    Traced,
+    WalkOptions,
+    WalkScene,
+    prepared_rays,
+)
 
 RAYS = 4
 """Rays of a program, which is a warp: eight threads each."""
@@ -37,6 +49,13 @@ MOST_NODES = 2**23
 """A node and the lanes left of it are one entry of 32 bits, its sign unused."""
 
 BY_INTERPRETER = BY_XLA._replace(quotient=lax.div)
+
+
+def trace_rays(
+    scene: WalkScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+) -> Traced:
+    """Trace rays as `walk.trace_rays` does, walking them by the kernel."""
+    return walk_rays(scene, prepared_rays(scene, origins, directions, t_max), options)
 
 
 def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, *, interpret: bool = False) -> Traced:
