@@ -1,6 +1,7 @@
 """The tracer: rays in, closest hits or any hits out."""
 
 import math
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -8,11 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from striptools.errors import StriptoolsError, UsageError
-from striptools.trace.device import DeviceKind, trace_devices
+from striptools.threads import in_chunks
+from striptools.trace.device import DeviceKind, core_count, trace_devices
 from striptools.trace.hit import Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Layout
-from striptools.trace.leaves import Rays, lay_out, lay_out_rebuilt
+from striptools.trace.leaves import Found, Rays, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import MISS, STUCK, WalkOptions
@@ -80,6 +82,7 @@ class Tracer:
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
+        self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
         if scene.instances is not None:
             resident, hierarchy = _of_instances(resident), "rebuilt"
         if resident == "auto":
@@ -159,10 +162,19 @@ class Tracer:
                 counted[at] = traced[2]
             _check_ended(traced[1])
             # On this side, while the devices are at the next rays.
-            self._layout.weigh(rays, at, traced, found)
+            self._weigh(rays, at, traced, found)
         if steps:
             counted[dropped == 1] = 1
         return Hits(t, face, u, v, triangle, counted if steps else None)
+
+    def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
+
+        def weigh(part: tuple[int, int]) -> None:
+            mine = slice(*part)
+            self._layout.weigh(rays, at[mine], tuple(a[mine] for a in traced[:2]), found)
+
+        in_chunks(weigh, len(at), self._weighers)
 
     def _stream(
         self, rays: Rays, dropped: np.ndarray, *, any_hit: bool, steps: bool
