@@ -7,7 +7,7 @@ MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
 sphere. Every answer of the GPU is compared with the CPU's: a difference in face or in a bit of t counts.
 Rates are given of whole calls, transfers and weighing of hits included, and of the device alone: rays made
-ready and walked, rays and results in its memory (median). `--twin` measures there the kernel's plain-JAX twin
+ready and walked, rays and results in its memory. `--twin` measures there the kernel's plain-JAX twin
 too. `--record` appends the figures to `results.csv`.
 """
 
@@ -89,7 +89,7 @@ def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse
 
 
 def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin: bool) -> float:
-    """Millions of rays a second, rays and results in the device's memory."""
+    """Millions of rays a second of many calls in a row, rays and results in the device's memory."""
     count = len(rays[0]) // RAYS * RAYS
     options = tracer._options(any_hit=any_hit, steps=False)
     if twin:
@@ -97,13 +97,13 @@ def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin
     run = program(tracer._mesh, options)
     reach = np.full(count, np.inf, np.float32)
     given = jax.device_put((rays[0][:count], rays[1][:count], reach), tracer.devices[0])
-    seconds = []
+    calls, best = 1 if twin else 20, np.inf
     with quiet_jax():
-        for _ in range(repeats + 2):
+        for _ in range(repeats + 1):
             start = time.perf_counter()
-            jax.block_until_ready(run(tracer._scene, *given))
-            seconds.append(time.perf_counter() - start)
-    return count / float(np.median(seconds[2:])) / 1e6
+            jax.block_until_ready([run(tracer._scene, *given) for _ in range(calls)])
+            best = min(best, time.perf_counter() - start)
+    return calls * count / best / 1e6
 
 
 def rate(name: str, count: int, metric: str, call: object, rays: Rays, repeats: int, note: str) -> Row:
