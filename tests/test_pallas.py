@@ -108,7 +108,7 @@ def test_a_deep_stack_is_kept():
     tracer = Tracer(scene, device="cpu", threads=1, hierarchy="rebuilt")
     # From beyond the last, past it: every node's other children wait on the stack until the first was seen.
     origins = np.zeros((COUNT, 3), np.float32)
-    directions = np.tile(np.float32([[1, 0, 0]]), (COUNT, 1))
+    directions = np.tile(np.array([[1, 0, 0]], np.float32), (COUNT, 1))
     origins[1::2, 0], directions[1::2] = 2.0**60, [-1, 0, 0]
     directions[::2, 1] = np.linspace(0, 0.2, COUNT // 2)
     directions[::2, 2] = np.linspace(-0.5, 0.5, COUNT // 2)
@@ -147,7 +147,7 @@ def test_more_nodes_than_an_entry_can_say_are_refused(monkeypatch):
     tracer = Tracer(small_scene(), device="cpu", threads=1)
     monkeypatch.setattr(kernel, "MOST_NODES", 8)
     with pytest.raises(NotImplementedError, match="8 nodes"):
-        kernel.walk_rays(tracer._scene, np.zeros((4, 24), np.float32), options_of(tracer), interpret=True)
+        kernel.walk_rays(tracer._scene, jax.numpy.zeros((4, 24)), options_of(tracer), interpret=True)
 
 
 def lowered_for_cuda(tracer, options):

@@ -240,7 +240,7 @@ class PackedScene(NamedTuple):
         newest, near = near >> width & mask, near & mask
         return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
 
-    def _windows(self, word: Array, bit: Array, further: Array, count: int = 4) -> Array:
+    def _windows(self, word: Array, bit: Array, further: Any, count: int = 4) -> Array:
         """Uint32: 32 bits of a stream from `bit` plus each of `further` on, all of them in `count` words."""
         at = word + (bit >> 5)
         loaded = [self._at(self.words, at + k) for k in range(count)]
@@ -277,7 +277,7 @@ class PackedScene(NamedTuple):
 class _Axis(NamedTuple):
     """How a block's coordinates on an axis are written: () each."""
 
-    offset: Array
+    offset: Any
     width: Array
     mode: Array
     anchor: Array

@@ -62,7 +62,7 @@ def source_of(scene: WalkScene) -> Source:
     return Source([scene.nodes, scene.blocks], lambda refs, *rest: WideTile(*refs, *rest))
 
 
-def lane_numbers(shape: tuple[int, int], dtype: Any) -> Array:
+def lane_numbers(shape: tuple[int, ...], dtype: Any) -> Array:
     """The number of each lane."""
     return lax.broadcasted_iota(dtype, shape, 1)
 
@@ -149,7 +149,7 @@ class PackedTile(PackedScene):
         """References in the order of `_packed_arrays`."""
         top_count, exponent = (jnp.broadcast_to(refs[k][...], shape) for k in range(2))
         faces = refs[8] if scene.has_faces else scene.faces
-        tile = cls(*refs[2:8], faces, top_count, exponent, scene.frame)
+        tile = cls(*[*refs[2:8], faces, top_count, exponent, scene.frame])
         tile.shape, tile.arithmetic, tile.mask = shape, arithmetic, None
         return tile
 

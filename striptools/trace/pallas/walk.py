@@ -142,7 +142,7 @@ class _State(NamedTuple):
     nearest: Array
     t: Array
     name: Array
-    turns: Array
+    turns: Any
     steps: tuple[Array, ...]
 
 
@@ -164,7 +164,7 @@ class _Walk:
 
     def walked(self) -> list[Array]:
         """T, name and, where they are counted, steps."""
-        state = lax.while_loop(lambda s: self.goes_on(s, DONE + 1), self.nodes_then_leaves, self.start())
+        state = lax.while_loop(lambda s: self.goes_on(s, int(DONE) + 1), self.nodes_then_leaves, self.start())
         name = self.closest_name(state)
         t = jnp.where(name < 0, np.float32(np.inf), self.arithmetic.product(state.nearest, self.ray.t_unit))
         return [t, jnp.where(state.child != DONE, STUCK, name), *state.steps]
