@@ -2,7 +2,7 @@
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import Any
 
@@ -69,17 +69,17 @@ def _walk_of(options: WalkOptions) -> tuple[Any, int]:
     """What walks rays, and how many arrays they are."""
     if options.kernel:
         # Here, so that a JAX without Pallas or its Triton does for all else.
-        from striptools.trace.pallas.trace import trace_rays as trace_by_kernel
+        from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
 
         return trace_by_kernel, 3
     return (trace_rays, 3) if options.batch else (walk_rays, 1)
 
 
-def _started(scene_for: Callable[[bool], Any], rays: list[Any], mesh: Mesh, options: WalkOptions) -> Any:
+def _started(scene: WalkScene, rays: list[Any], mesh: Mesh, options: WalkOptions) -> Any:
     """Start a tile; where the kernel cannot be compiled, say so once, and let its twin walk."""
     if options.kernel and options not in _refused:
         try:
-            return program(mesh, options)(scene_for(True), *rays)
+            return program(mesh, options)(scene, *rays)
         except Exception as error:
             # Pallas, Triton and XLA raise as they please; of what else is wrong the twin will tell.
             _refused.add(options)
@@ -89,27 +89,20 @@ def _started(scene_for: Callable[[bool], Any], rays: list[Any], mesh: Mesh, opti
                 SlowTracingWarning,
                 stacklevel=2,
             )
-    return program(mesh, options._replace(kernel=False))(scene_for(False), *rays)
+    return program(mesh, options._replace(kernel=False))(scene, *rays)
 
 
 def stream(
-    scene_for: Callable[[bool], Any], rays: Rays, mesh: Mesh, options: WalkOptions
+    scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-    """Trace any number of rays by devices that prepare them; yield slices of them and results, in order.
-
-    Args:
-        scene_for: The scene on the devices, as the kernel takes it or its twin.
-        rays: Origins, directions and t_max.
-        mesh: The devices.
-        options: What to compile in.
-    """
+    """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
     split = NamedSharding(mesh, _RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
     for part, per_device in tiles(len(rays[0]), mesh.size, GPU_TILES):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
             on_device = jax.device_put(padded, split)
-            waiting.append((part, per_device, _started(scene_for, on_device, mesh, options)))
+            waiting.append((part, per_device, _started(scene, on_device, mesh, options)))
         if len(waiting) >= IN_FLIGHT:
             yield _collect(*waiting.popleft(), mesh.size)
     while waiting:

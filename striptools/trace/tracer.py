@@ -107,24 +107,8 @@ class Tracer:
 
     def _take(self, layout: Layout) -> None:
         self._layout: Layout = layout
-        self._scenes: dict[bool, Any] = {}
+        self._scene = replicate(layout.arrays, self._mesh)
         self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
-
-    @property
-    def _scene(self) -> Any:
-        """The scene on the devices, as all but GPU kernels take it."""
-        return self._scene_for(False)
-
-    def _scene_for(self, kernel: bool) -> Any:
-        """The scene on the devices, put there when it is first asked for."""
-        if kernel not in self._scenes:
-            arrays = self._layout.arrays
-            if kernel:
-                from striptools.trace.pallas.trace import kernel_scene
-
-                arrays = kernel_scene(arrays)
-            self._scenes[kernel] = replicate(arrays, self._mesh)
-        return self._scenes[kernel]
 
     @property
     def devices(self) -> list[Any]:
@@ -202,7 +186,7 @@ class Tracer:
         if not options.batch:
             yield from stream_ready(self._scene, self._layout, rays, dropped, self._mesh, options)
             return
-        for part, traced in stream(self._scene_for, rays, self._mesh, options):
+        for part, traced in stream(self._scene, rays, self._mesh, options):
             yield np.arange(part.start, part.stop, dtype=np.int32), traced
 
     def any_hit(

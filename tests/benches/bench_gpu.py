@@ -25,7 +25,7 @@ from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.device import quiet_jax
 from striptools.trace.launch import program
-from striptools.trace.pallas.walk_binary import RAYS
+from striptools.trace.pallas.walk import RAYS
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import ResidentKind
 
@@ -94,14 +94,14 @@ def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin
     options = tracer._options(any_hit=any_hit, steps=False)
     if twin:
         options = options._replace(kernel=False)
-    run, scene = program(tracer._mesh, options), tracer._scene_for(options.kernel)
+    run = program(tracer._mesh, options)
     reach = np.full(count, np.inf, np.float32)
     given = jax.device_put((rays[0][:count], rays[1][:count], reach), tracer.devices[0])
     calls, best = 1 if twin else 20, np.inf
     with quiet_jax():
         for _ in range(repeats + 1):
             start = time.perf_counter()
-            jax.block_until_ready([run(scene, *given) for _ in range(calls)])
+            jax.block_until_ready([run(tracer._scene, *given) for _ in range(calls)])
             best = min(best, time.perf_counter() - start)
     return calls * count / best / 1e6
 

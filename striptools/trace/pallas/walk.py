@@ -39,6 +39,7 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     WalkScene,
+    prepared_rays,
 )
 
 RAYS = 4
@@ -48,6 +49,13 @@ MOST_NODES = 2**23
 """A node and the lanes left of it are one entry of 32 bits, its sign unused."""
 
 BY_INTERPRETER = BY_XLA._replace(quotient=lax.div)
+
+
+def trace_rays(
+    scene: WalkScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+) -> Traced:
+    """Trace rays as `walk.trace_rays` does, walking them by the kernel."""
+    return walk_rays(scene, prepared_rays(scene, origins, directions, t_max), options)
 
 
 def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, *, interpret: bool = False) -> Traced:
@@ -88,14 +96,14 @@ def _kernel(
     ready, results = refs[given], refs[given + 1 :]
     row = pl.program_id(0) * RAYS + lax.broadcasted_iota(np.int32, shape, 0)
     tile = source.tile(list(refs[:given]), shape, arithmetic)
-    ray = ray_at(ready, row)
+    ray = _ray_at(ready, row)
     walk = _Walk(tile, ray, options, arithmetic, RAYS * scene.node_count, scene.has_faces)
     for ref, values in zip(results, walk.walked(), strict=True):
         # Every lane writes the same.
         plgpu.store(ref.at[row], values)
 
 
-class Ray(NamedTuple):
+class _Ray(NamedTuple):
     """What `walk._Ray` holds, a tile apiece."""
 
     slab: Slab
@@ -108,13 +116,13 @@ class Ray(NamedTuple):
     visited: Array
 
 
-def ray_at(ready: Any, row: Array) -> Ray:
+def _ray_at(ready: Any, row: Array) -> _Ray:
     """Read rays, laid out as `walk._Ray` says."""
     words = [plgpu.load(ready.at[row, k]) for k in range(FLOATS + 7)]
     floats, ints = words[:FLOATS], [lax.bitcast_convert_type(word, np.int32) for word in words[FLOATS:]]
     slab = Slab(floats[0:3], floats[3:6], floats[6:9])  # pyright: ignore[reportArgumentType]
     shear = Shear((ints[0], ints[1], ints[2]), (floats[9], floats[10], floats[11]), *floats[12:15])
-    return Ray(slab, shear, floats[15], floats[16], ints[3], ints[4] ^ DONE, ints[5], ints[6])
+    return _Ray(slab, shear, floats[15], floats[16], ints[3], ints[4] ^ DONE, ints[5], ints[6])
 
 
 class _State(NamedTuple):
@@ -148,7 +156,7 @@ class _Walk:
     """The steps of the walk of one program's rays."""
 
     tile: Tile
-    ray: Ray
+    ray: _Ray
     options: WalkOptions
     arithmetic: Arithmetic
     bound: int
@@ -232,7 +240,7 @@ class _Walk:
             tile = self.tile.among(tied)
             return tied & (tile.faces_of(name) < tile.faces_of(other))
 
-        return lax.cond(any_of(tied), by_face, lambda: tied)
+        return lax.cond(_any(tied), by_face, lambda: tied)
 
     def top_of(self, state: _State) -> Array:
         """The entry on top of the stack; 0, which is no lane, where there is none."""
@@ -270,6 +278,6 @@ class _Walk:
         return jnp.where(least == NO_NAME, MISS, least)
 
 
-def any_of(flags: Array) -> Array:
+def _any(flags: Array) -> Array:
     """() bool: whether any is set."""
     return jnp.max(jnp.where(flags, np.int32(1), np.int32(0)).reshape(-1)) > 0
