@@ -50,7 +50,8 @@ class Tracer:
 
     Args:
         scene: What to trace.
-        device: "auto" takes a GPU where JAX has one.
+        device: "auto" takes a GPU where JAX has one. A kernel walks the rays there; where it cannot be
+            compiled, a `SlowTracingWarning` says why, and its plain-JAX twin walks them, with the same hits.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
             triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
