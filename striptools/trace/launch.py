@@ -21,7 +21,7 @@ TILES = (2**8, 2**12, 2**16)
 nothing."""
 
 GPU_TILES = (2**12, 2**16, 2**20)
-"""Rays a GPU takes at once. Its kernel is done with 2**18 in no time, but whole calls are slower by a third."""
+"""Rays a GPU takes at once: with 2**18, which the kernel does as fast, whole calls are slower by a third."""
 
 IN_FLIGHT = 4
 """Tiles that a GPU works on or waits for while results are taken: bounds memory, whatever the number of

@@ -287,17 +287,17 @@ def _any(flags: Array) -> Array:
 
 # Notes
 #
-# NVIDIA H100, 2**20 rays in its memory, Mray/s of closest hits, camera / occlusion / random: Stanford dragon
-# expanded 1233 / 550 / 819, compressed 728 / 302 / 473; the twin does 1 to 6. Plain CUDA with one ray a thread
-# through a rebuilt binary hierarchy and a test that leaks (`bench_gpu_yardstick`) does 4142 / 1294 / 2859. The
-# kernel is bound by the instructions it issues: 115 for a node and 215 for an expanded leaf of four rays. No
-# value moves through shared memory, nothing is spilled, 64 registers let 32 warps be at work.
+# NVIDIA H100, 2**20 rays in its memory, Mray/s of closest hits, camera / occlusion / random, Stanford dragon:
+# expanded 1233 / 550 / 819, compressed 728 / 302 / 473; the twin does 1 to 6. Plain CUDA, one ray a thread
+# through a rebuilt binary hierarchy, with a test that leaks (`bench_gpu_yardstick`), does 4142 / 1294 / 2859.
+# A step at nodes takes 115 instructions, one at expanded leaves 215, of four rays. Compiled by Triton 3.6, no
+# value moves through shared memory, nothing is spilled, and 64 registers let 32 warps be at work.
 #
 # Tried and lost (speed over what stands here): one ray a thread through a binary hierarchy made of the wide
 # one's lanes, a node in four reads of 16 bytes, the stack in memory: 0.98 / 0.80 / 0.83; eight rays a warp
 # 0.82 / 0.72 / 0.69; nodes read without a mask, by waiting rays too, 0.98 / 0.79 / 0.96; on to the leaves as
-# soon as more rays wait there than are at nodes 0.94 / 0.91 / 0.94, or twice as many 0.90 / 0.98 / 0.95; a node,
-# then a leaf, in turns 0.98 / 0.84 / 0.97.
+# soon as more rays wait there than are at nodes 0.94 / 0.91 / 0.94, or twice as many 0.90 / 0.98 / 0.95; a
+# node, then a leaf, in turns 0.98 / 0.84 / 0.97.
 #
 # Not tried: addresses take three instructions a read, since Triton's offsets are 32 bits wide and may wrap; a
 # vote would do for a sum over lanes, but Triton has none, and assembly must not know which thread has a lane.
