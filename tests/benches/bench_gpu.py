@@ -1,13 +1,14 @@
 """Tracing on a GPU against the CPU path in the same process: the same hits, and rays a second.
 
     python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5]
-        [--resident expanded compressed] [--record] [--note TEXT]
+        [--resident expanded compressed] [--twin] [--record] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed; ambient
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
 sphere. Every answer of the GPU is compared with the CPU's: a difference in face or in a bit of t counts.
-Seconds are those of a whole call, transfers and weighing of hits included. `--record` appends the figures to
-`results.csv`.
+Rates are given of whole calls, transfers and weighing of hits included, and of the device alone: rays made
+ready and walked, rays and results in its memory. `--twin` measures there the kernel's plain-JAX twin
+too. `--record` appends the figures to `results.csv`.
 """
 
 import argparse
@@ -22,6 +23,9 @@ from results import Row, append
 import striptools
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
+from striptools.trace.device import quiet_jax
+from striptools.trace.launch import program
+from striptools.trace.pallas.walk import RAYS
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import ResidentKind
 
@@ -38,6 +42,7 @@ def main() -> int:
     parser.add_argument("--rays", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--resident", nargs="+", default=["expanded", "compressed"])
+    parser.add_argument("--twin", action="store_true")
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--note", default="")
     arguments = parser.parse_args()
@@ -67,9 +72,7 @@ def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse
         ours, wanted = gpu.closest_hit(*rays), cpu.closest_hit(*rays)
         wrong = int(((ours.face != wanted.face) | (ours.t.view(np.int32) != wanted.t.view(np.int32))).sum())
         wrong_any = int((gpu.any_hit(*rays) != (wanted.face >= 0)).sum())
-        note = "; ".join(
-            filter(None, [f"{device}, {resident}, {len(rays[0])} rays, whole calls", arguments.note])
-        )
+        note = "; ".join(filter(None, [f"{device}, {resident}, {len(rays[0])} rays", arguments.note]))
         count = scene.triangle_count
         rows += [
             Row("gpu", name, count, f"differing closest hits, {kind}", wrong, "rays", note=note),
@@ -77,7 +80,30 @@ def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse
             rate(name, count, f"{kind} rays, closest hit", gpu.closest_hit, rays, arguments.repeats, note),
             rate(name, count, f"{kind} rays, any hit", gpu.any_hit, rays, arguments.repeats, note),
         ]
+        for twin in (False, True)[: 1 + arguments.twin]:
+            for any_hit, what in ((False, "closest hit"), (True, "any hit")):
+                metric = f"{kind} rays, {what}, {'twin' if twin else 'kernel'}, on the device alone"
+                value = device_rate(gpu, rays, arguments.repeats, any_hit=any_hit, twin=twin)
+                rows.append(Row("gpu", name, count, metric, value, "Mray/s", note=note))
     return rows
+
+
+def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin: bool) -> float:
+    """Millions of rays a second of many calls in a row, rays and results in the device's memory."""
+    count = len(rays[0]) // RAYS * RAYS
+    options = tracer._options(any_hit=any_hit)
+    if twin:
+        options = options._replace(kernel=False)
+    run = program(tracer._mesh, options)
+    reach = np.full(count, np.inf, np.float32)
+    given = jax.device_put((rays[0][:count], rays[1][:count], reach), tracer.devices[0])
+    calls, best = 1 if twin else 20, np.inf
+    with quiet_jax():
+        for _ in range(repeats + 1):
+            start = time.perf_counter()
+            jax.block_until_ready([run(tracer._scene, *given) for _ in range(calls)])
+            best = min(best, time.perf_counter() - start)
+    return calls * count / best / 1e6
 
 
 def rate(name: str, count: int, metric: str, call: object, rays: Rays, repeats: int, note: str) -> Row:
