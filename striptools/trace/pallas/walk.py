@@ -277,7 +277,7 @@ def _any(flags: Array) -> Array:
 # Notes
 #
 # NVIDIA H100, 2**20 rays in its memory, Mray/s of closest hits, camera / occlusion / random, Stanford dragon:
-# expanded 1233 / 550 / 819, compressed 728 / 302 / 473; the twin does 1 to 6. Plain CUDA, one ray a thread
+# expanded 1253 / 562 / 839, compressed 711 / 297 / 462; the twin does 1 to 6. Plain CUDA, one ray a thread
 # through a rebuilt binary hierarchy, with a test that leaks (`bench_gpu_yardstick`), does 4142 / 1294 / 2859.
 # A step at nodes takes 115 instructions, one at expanded leaves 215, of four rays. Compiled by Triton 3.6, no
 # value moves through shared memory, nothing is spilled, and 64 registers let 32 warps be at work.
