@@ -181,7 +181,7 @@ def test_where_the_kernel_cannot_be_compiled_its_twin_walks():
     origins, directions, _ = odd_rays(scene)
     tracer = Tracer(scene, device="cpu", threads=1)
     wanted = tracer.closest_hit(origins, directions)
-    tracer._on_gpu = True
+    tracer._on_gpu = tracer._kernel = True
     launch._refused.clear()
     with pytest.warns(SlowTracingWarning, match="kernel cannot be compiled here") as told:
         found = tracer.closest_hit(origins, directions)

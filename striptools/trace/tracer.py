@@ -121,7 +121,7 @@ class Tracer:
     def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
         """Take the devices to trace on."""
         devices = trace_devices(device, threads)
-        self._on_gpu = devices[0].platform != "cpu"
+        self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
         self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
         return devices
@@ -391,7 +391,7 @@ class Tracer:
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
         plain = not counting and gather is None
-        kernel = self._on_gpu and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
+        kernel = self._kernel and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
         given = (self._stack_size, self._on_gpu, decode, gather, most, kernel)
         return WalkOptions(side_by_side, any_hit, counting, *given)
 
