@@ -13,6 +13,7 @@ from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 from rays import aimed_rays
 from scenes import scene_of, small_scene
 
+from striptools.hierarchies.options import HierarchyOptions
 from striptools.mesh.mesh import Mesh
 from striptools.threads import in_chunks
 from striptools.trace import SlowTracingWarning, Tracer, launch
@@ -190,6 +191,18 @@ def test_where_the_kernel_cannot_be_compiled_its_twin_walks():
     np.testing.assert_array_equal(found.face, wanted.face)
     # It is said once.
     tracer.closest_hit(origins, directions)
+
+
+def test_the_kernel_only_walks_what_it_can():
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    other = Tracer(scene.under(HierarchyOptions("slbvh")), device="cpu", threads=1)
+    tracer._kernel = other._kernel = True
+    assert tracer._options().kernel
+    assert tracer._options(any_hit=True).kernel
+    assert not tracer._options(counting=True).kernel
+    assert not tracer._options(gather="count").kernel
+    assert not other._options().kernel
 
 
 def test_hits_are_weighed_by_many_threads_alike(monkeypatch):
