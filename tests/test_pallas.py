@@ -198,11 +198,17 @@ def test_the_kernel_only_walks_what_it_can():
     tracer = Tracer(scene, device="cpu", threads=1)
     other = Tracer(scene.under(HierarchyOptions("slbvh")), device="cpu", threads=1)
     tracer._kernel = other._kernel = True
-    assert tracer._options().kernel
-    assert tracer._options(any_hit=True).kernel
-    assert not tracer._options(counting=True).kernel
-    assert not tracer._options(gather="count").kernel
-    assert not other._options().kernel
+
+    def by_kernel(tracer, **asked):
+        options = tracer._options(**asked)
+        assert options is not None
+        return options.kernel
+
+    assert by_kernel(tracer)
+    assert by_kernel(tracer, any_hit=True)
+    assert not by_kernel(tracer, counting=True)
+    assert not by_kernel(tracer, gather="count")
+    assert not by_kernel(other)
 
 
 def test_hits_are_weighed_by_many_threads_alike(monkeypatch):
