@@ -1,6 +1,7 @@
 """The tracer: rays in, closest hits or any hits out."""
 
 import math
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -9,15 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.threads import in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
 from striptools.trace.counters import KINDS, counters_of
-from striptools.trace.device import DeviceKind, quiet_jax, trace_devices
+from striptools.trace.device import DeviceKind, core_count, quiet_jax, trace_devices
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
-from striptools.trace.layout import Layout, Rays
+from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
@@ -58,7 +60,8 @@ class Tracer:
 
     Args:
         scene: What to trace.
-        device: "auto" takes a GPU where JAX has one.
+        device: "auto" takes a GPU where JAX has one. A kernel walks the rays there; where it cannot be
+            compiled, a `SlowTracingWarning` says why, and its plain-JAX twin walks them, with the same hits.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
             triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
@@ -118,8 +121,9 @@ class Tracer:
     def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
         """Take the devices to trace on."""
         devices = trace_devices(device, threads)
-        self._on_gpu = devices[0].platform != "cpu"
+        self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
+        self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
         return devices
 
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
@@ -196,10 +200,19 @@ class Tracer:
                 counted[at] = traced[2]
             check_ended(traced[1])
             # On this side, while the devices are at the next rays.
-            self._layout.weigh(rays, at, traced, found)
+            self._weigh(rays, at, traced, found)
         if counters:
             counted[dropped == 1] = self._layout.missed if not self._empty else 0
         return Hits(t, face, u, v, triangle, counters_of(counted) if counters else None)
+
+    def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
+
+        def weigh(part: tuple[int, int]) -> None:
+            mine = slice(*part)
+            self._layout.weigh(rays, at[mine], tuple(a[mine] for a in traced[:2]), found)
+
+        in_chunks(weigh, len(at), self._weighers)
 
     def _stream(
         self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
@@ -377,7 +390,9 @@ class Tracer:
             self._need_wide_nodes()
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        given = (self._stack_size, self._on_gpu, decode, gather, most)
+        plain = not counting and gather is None
+        kernel = self._kernel and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
+        given = (self._stack_size, self._on_gpu, decode, gather, most, kernel)
         return WalkOptions(side_by_side, any_hit, counting, *given)
 
 

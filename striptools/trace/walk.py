@@ -34,7 +34,16 @@ from jaxtyping import Int32
 
 from striptools.trace.box import Slab, slab_of
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
+from striptools.trace.numerics import (
+    BY_XLA,
+    Arithmetic,
+    folded,
+    index,
+    larger,
+    power_of_two_below,
+    quotient,
+    smaller,
+)
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, shear_of
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 
@@ -103,10 +112,10 @@ class Leaf(NamedTuple):
     filled: Array | None
     name: Array
 
-    def crossings(self, shear: Shear) -> Array:
+    def crossings(self, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Array:
         """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
-        t = crossing_of(edges_of(self.x, self.y, self.z, shear), self.turn)
-        return t if self.filled is None else jnp.where(self.filled, t, jnp.float32(0))
+        t = crossing_of(edges_of(self.x, self.y, self.z, shear, arithmetic), self.turn, arithmetic)
+        return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
 
 
 class WalkScene(Protocol):
@@ -179,6 +188,7 @@ class WalkOptions(NamedTuple):
         decode: How leaves are decoded, where they are packed.
         gather: What to gather in the place of the closest hit, if anything.
         most: How many hits to gather, where all are.
+        kernel: Walk by the kernel of `trace.pallas`, whose twin `batch` is; nothing is counted or gathered.
     """
 
     interleave: int
@@ -189,6 +199,7 @@ class WalkOptions(NamedTuple):
     decode: "Decode | None" = None
     gather: GatherKind | None = None
     most: int = 0
+    kernel: bool = False
 
 
 class Decode(NamedTuple):
