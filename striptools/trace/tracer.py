@@ -353,6 +353,8 @@ class Tracer:
         checked = checked_points(points)
         if self._empty:
             return np.zeros(len(checked), np.float32)
+        if self._shared:
+            self._need_wide_nodes()
         if self._resident == "compressed":
             raise UsageError(
                 "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
@@ -448,9 +450,7 @@ def _shares(scene: "Scene", instances: InstancesKind, resident: ResidentKind, bu
 def _of_flattened(resident: ResidentKind) -> ResidentKind:
     """How flattened instances are kept."""
     if resident == "compressed":
-        raise UsageError(
-            "flattened instances are expanded", where="resident", remedy="use instances shared"
-        )
+        raise UsageError("flattened instances are expanded", where="resident", remedy="use instances shared")
     return "expanded"
 
 

@@ -562,7 +562,9 @@ def _walk_group(
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
     rays = tuple(ready_ray(row) for row in group)
-    state, bests = _walked(_Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays))
+    state, bests = _walked(
+        _Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays)
+    )
     results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
     t, name, count = (jnp.stack([r[k] for r in results]) for k in range(3))
     counters = jnp.zeros((len(rays), 0), jnp.int32)
