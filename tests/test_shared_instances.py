@@ -1,4 +1,4 @@
-"""Instances that share their geometry, traced: the hits of the flattened scene, and no leak inside any of them."""
+"""Instances that share their geometry, traced: the hits of the flattened scene, and no leak inside any."""
 
 from dataclasses import replace
 
@@ -80,10 +80,10 @@ def rays_through(scene, count, seed=0):
 
 
 def bounds_on_t(scene, origins, directions, hits):
-    """How far t of a shared instance may be from that of the flattened one, by `walk_instances`, Boxes, and points.
+    """How far t of a shared instance, and its point, may be from the flattened one's.
 
-    The moved ray is off by at most f times the largest coordinate; so is the flattened hit, by 8 u of it; both
-    meet the plane of the face, whose normal turns a distance into one along the ray.
+    The moved ray is off by at most f times the largest coordinate (`walk_instances`, Boxes), the flattened hit
+    by 8 u of it; both meet the plane of the face, whose normal turns a distance into one along the ray.
     """
     moves = moves_of(scene, geometry_boxes(scene))
     placed = scene.placed()

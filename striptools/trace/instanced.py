@@ -1,7 +1,7 @@
 """A scene with instances laid out for the walk: each geometry once, and a hierarchy over where they stand.
 
-What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances` says why.
-Cost beside the geometries: 60 bytes an instance and about 40 of the nodes over them.
+What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances`
+says why. Cost beside the geometries: 60 bytes an instance and about 40 of the nodes over them.
 """
 
 from collections.abc import Iterator
@@ -163,7 +163,7 @@ class InstancedLayout:
         )
 
     def stream(
-        self, scene: InstancedScene, rays: Rays, mesh: Mesh, options: WalkOptions
+        self, scene: Any, rays: Rays, mesh: Mesh, options: WalkOptions
     ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
         """Trace any number of rays; yield slices of them and results, in order."""
         yield from stream_through(instances_program(mesh, options), scene, rays, mesh, GPU_TILES)
@@ -175,11 +175,11 @@ class InstancedLayout:
         hit = np.flatnonzero(instance >= 0)
         t[at] = traced[0]
         instance, rows = instance[hit], at[hit]
-        inside = tuple(np.zeros(len(hit), one.dtype) for one in found)
+        own_t, own_face, own_u, own_v, own_triangle = (np.zeros(len(hit), one.dtype) for one in found)
+        inside = (own_t, own_face, own_u, own_v, own_triangle)
         local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
         given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
         self.geometries.weigh(local, *given, inside)
-        _, own_face, own_u, own_v, own_triangle = inside
         geometry, turned = self.numbers.geometry[instance], self.mirrored[instance]
         face[rows] = own_face + (self.numbers.first_face[instance] - self.first_face[geometry])
         triangle[rows] = own_triangle + (
@@ -317,7 +317,7 @@ def _inverted(a: np.ndarray) -> np.ndarray:
 def _slips(
     a: np.ndarray, b: np.ndarray, matrices: np.ndarray, extent: np.ndarray, reach: float
 ) -> np.ndarray:
-    """(k,) f of each instance, infinite where it is no bound; `extent` is the geometry's largest coordinate."""
+    """(k,) f of each instance, infinite where it is no bound; `extent`: the largest coordinate of each's."""
 
     def row_sum(m: np.ndarray) -> np.ndarray:
         return m.sum(axis=2).max(axis=1)

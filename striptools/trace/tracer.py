@@ -53,9 +53,9 @@ class Tracer:
 
     In a scene with instances a hit's face is that of the flattened source (`Mesh.flattened` of the mesh that
     was converted), its triangle one of `scene.placed()`; instance, geometry and the face within it are told
-    beside. "shared" keeps each geometry once and moves rays into its frame: as watertight inside each
-    instance, and t is that of the moved ray, as far from that of "flattened" as float32 puts it (`instanced`).
-    Where geometries are expanded, `hierarchy` is always rebuilt.
+    beside. "shared" keeps each geometry once and moves rays into its frame: inside each instance as
+    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). Where
+    geometries are expanded, `hierarchy` is always rebuilt.
 
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.

@@ -348,13 +348,13 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     return Traced(t, name, counters, counted.reshape(-1))
 
 
-def _floor(scene: WalkScene, options: WalkOptions) -> Array:
+def _floor(scene: Any, options: WalkOptions) -> Array:
     """An empty stack: its bottom has a lane that no node has."""
     bottom = jnp.array([scene.node_count - 1, 256], jnp.int32)
     return jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
 
 
-def prepared_ray(scene: WalkScene, origin: Array, direction: Array, t_max: Array, root: Array) -> Array:
+def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root: Array) -> Array:
     """One ready ray that starts at any node: (24,) float32."""
     floats, ints = _prepare(scene, origin, direction, t_max)
     start = (jnp.arange(len(ints)) == START) & (ints != 0)
@@ -403,7 +403,7 @@ def largest_of(vector: Array) -> Array:
 
 
 def scaled_ray(frame: Frame, origin: Array, direction: Array) -> tuple[Array, Array, Array]:
-    """Origin and direction scaled by powers of two, the direction's largest component to 1 to 2; whether finite."""
+    """A ray scaled by powers of two, the direction's largest component to 1 to 2; whether it is finite."""
     shorten = power_of_two_below(largest_of(direction))[0]
     origin = origin * frame.scale
     finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
@@ -604,12 +604,12 @@ class Alone(NamedTuple):
 
 
 def walk_alone(
-    scene: WalkScene, row: Array, options: WalkOptions, nothing: Callable[[ReadyRay], Any] | None = None
+    scene: Any, row: Array, options: WalkOptions, nothing: Callable[[ReadyRay], Any] | None = None
 ) -> Alone:
     """Walk one ray.
 
     Args:
-        scene: What to trace.
+        scene: What to trace: of `WalkScene` what the walk asks.
         row: (24,) float32, as from `prepared_ray`.
         options: What to compile in.
         nothing: What the ray has found before; None for no triangle.
@@ -621,7 +621,7 @@ def walk_alone(
     return Alone(ray, state.places[0].child == DONE, bests[0], visits)
 
 
-def found_alone(scene: WalkScene, end: Alone, any_hit: bool) -> tuple[Array, Array]:
+def found_alone(scene: Any, end: Alone, any_hit: bool) -> tuple[Array, Array]:
     """What is reported of the walk of one ray: t in the caller's units, and the name of the triangle."""
     child = jnp.where(end.ended, DONE, 0)
     place = Place(child, child, child, child, child)

@@ -13,9 +13,9 @@ stack of its own, and the closest hit is carried back.
 4. Of two hits at the same t that of the first instance is kept: faces of the flattened source are numbered
    in the order of instances.
 
-**Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w be
-what a ray is moved by: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d
-the moved one is off by
+**Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w
+move a ray into it: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d the
+moved one is off by
 
     e = gamma_4 (|W||o| + |w|) in the origin,   gamma_3 |W||d| in the direction,
 
@@ -28,10 +28,11 @@ and of the placed scene. The point hit may lie 6 u M outside the geometry's box,
 there of origin and geometry (`box`, difference 1), which A enlarges to 6 u (k s + h + a), a the largest row
 sum of |A| times the geometry's largest coordinate. All in all Q is within f s of the ray, for
 
-    f s = ((gamma_4 k + n) s + 2 (gamma_3 k + n) s + gamma_4 h + |r|) / (1 - gamma_3 k - n) + 6 u (k s + h + a)
+    f s = ((gamma_4 k + n) s + 2 (gamma_3 k + n) s + gamma_4 h + |r|) / (1 - gamma_3 k - n)
+          + 6 u (k s + h + a)
 
-and an instance whose box, widened by f s, the ray does not meet before the closest hit has nothing to say. f is
-computed by `instanced`, and each lane of a node holds the largest f below it. For turned and evenly scaled
+and an instance whose box, widened by f s, the ray does not meet before the closest hit has nothing to say.
+`instanced` computes f, and each lane of a node holds the largest f below it. For turned and evenly scaled
 instances it is about 2^-18.
 """
 
@@ -39,7 +40,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
@@ -54,7 +54,6 @@ from striptools.trace.walk import (
     Frame,
     ReadyRay,
     WalkOptions,
-    WalkScene,
     found_alone,
     largest_of,
     prepared_ray,
@@ -229,7 +228,7 @@ def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOption
     """Walk one ray over the instances."""
     origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
     seen = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
-    row = prepared_ray(seen, *ray, jnp.int32(0))
+    row = prepared_ray(seen, ray[0], ray[1], ray[2], jnp.int32(0))
     none = jnp.int32(MISS)
 
     def nothing(ready: ReadyRay) -> _Nearest:
