@@ -82,7 +82,7 @@ def rays_through(scene, count, seed=0):
 def bounds_on_t(scene, origins, directions, hits):
     """How far t of a shared instance, and its point, may be from the flattened one's.
 
-    The moved ray is off by at most f times the largest coordinate (`walk_instances`, Boxes), the flattened hit
+    The moved ray is off by at most f times the largest coordinate (`walk_instances`), the flattened hit
     by 8 u of it; both meet the plane of the face, whose normal turns a distance into one along the ray.
     """
     moves = moves_of(scene, geometry_boxes(scene))
