@@ -12,7 +12,13 @@ from striptools.mesh.mesh import Mesh
 from striptools.pipeline import convert
 from striptools.trace import Tracer
 from striptools.trace import instanced as laying
-from striptools.trace.instanced import InstanceNumbers, geometry_boxes, lay_out_instanced, moves_of
+from striptools.trace.instanced import (
+    InstanceNumbers,
+    geometry_boxes,
+    instances_program,
+    lay_out_instanced,
+    moves_of,
+)
 
 KINDS = ("expanded", "compressed")
 
@@ -240,6 +246,20 @@ def test_rays_that_are_none_miss():
     rows = np.array([[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 0], [1, 0, 0]], np.float32)
     assert not tracer.closest_hit(np.roll(rows, 1, axis=0)[:3], rows[:3]).hit.any()
     assert not tracer.any_hit(np.zeros((3, 3)), rows[:3]).any()
+
+
+def test_all_rays_at_once_find_the_same(crowd):
+    """As a GPU walks them: every loop over all rays, whichever branch they take."""
+    _, scene = crowd
+    tracer = Tracer(scene, device="cpu", threads=1, instances="shared")
+    rays = (*rays_through(scene, 256, 4), np.full(256, np.inf, np.float32))
+    options = tracer._options()
+    one, other = (
+        instances_program(tracer._mesh, options._replace(batch=batch))(tracer._scene, *rays)
+        for batch in (False, True)
+    )
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
 def test_counters_count_both_levels(crowd):

@@ -1,10 +1,10 @@
 """Light of one bounce: a sun with shadows, and a sky that ambient occlusion lets through.
 
 Occlusion is that of Zhukov, Iones & Kronin, "An Ambient Light Illumination Model" (EGWR 1998): the share of
-the sky, weighed by the cosine, that nothing near hides. Rays towards it are spread by Malley's method (`rays`)
-from the points of a rank-1 lattice, the same for all places but for a shift of its own (Cranley & Patterson,
-"Randomization of Number Theoretic Methods for Multiple Integration", SIAM J. Numer. Anal. 13(6), 1976): what
-a place gets depends on its number alone, not on tiles, threads or calls.
+the sky, weighed by the cosine, that nothing near hides. Rays towards it are spread by Malley's method
+(`rays`) from the points of a rank-1 lattice, the same for all places but for a shift of its own (Cranley &
+Patterson, "Randomization of Number Theoretic Methods for Multiple Integration", SIAM J. Numer. Anal. 13(6),
+1976): what a place gets depends on its number alone, not on tiles, threads or calls.
 
 Cost: an any-hit ray towards the sun and `rays` towards the sky for each place that is seen.
 """

@@ -1,4 +1,4 @@
-"""The surface of a scene where it stands, as pictures need it: only of triangles hit, and nothing flattened."""
+"""The surface of a scene where it stands, as pictures need it: of triangles hit, and nothing flattened."""
 
 from __future__ import annotations
 
