@@ -286,7 +286,7 @@ def test_the_slip_holds_for_the_moved_ray(crowd):
     """In float64, where the moved ray gets to in each instance is within f of where the ray does."""
     _, scene = crowd
     layout = lay_out_instanced(scene)
-    moves, random = layout.moves, np.random.default_rng(5)
+    moves, random = moves_of(scene, geometry_boxes(scene)), np.random.default_rng(5)
     matrix = scene.instances.matrix
     inner = float(layout.geometries.arrays.frame.scale)
     worst = 0.0

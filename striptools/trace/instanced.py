@@ -1,7 +1,7 @@
 """A scene with instances laid out for the walk: each geometry once, and a hierarchy over where they stand.
 
 What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances`
-says why. Cost beside the geometries: 60 bytes an instance and about 40 of the nodes over them.
+says why. Cost beside the geometries: 80 bytes an instance, about 40 of the nodes over them, and size classes.
 """
 
 from collections.abc import Iterator
@@ -110,7 +110,6 @@ class InstancedLayout:
         arrays: For the device, as NumPy arrays.
         geometries: All geometries, each in its own frame.
         depth: The most nodes on a way from a root down, of instances or of a geometry.
-        moves: How rays get there.
         numbers: What hits are called.
         first_triangle: (g,) int64, the first triangle in file order of each geometry.
         first_face: (g,) int64, its first source face; triangle without a remap.
@@ -120,7 +119,6 @@ class InstancedLayout:
     arrays: InstancedScene
     geometries: Layout
     depth: int
-    moves: Moves
     numbers: InstanceNumbers
     first_triangle: np.ndarray
     first_face: np.ndarray
@@ -151,7 +149,8 @@ class InstancedLayout:
     def nbytes(self) -> int:
         """Bytes of all arrays."""
         arrays = self.arrays
-        above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches)
+        above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches, self.numbers.geometry)
+        above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -191,11 +190,11 @@ class InstancedLayout:
         self, origins: np.ndarray, directions: np.ndarray, instance: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rays in the frames of the geometries that they hit, as the walk moves them, and not scaled."""
-        matrix = self.moves.matrices[instance]
+        matrix = self.arrays.matrices[instance]
         with np.errstate(all="ignore"):
             _, exponent = np.frexp(np.abs(directions).max(axis=1, initial=0))
             shortened = np.ldexp(directions, 1 - exponent[:, None])
-            origin = _turned(matrix, origins * self.moves.scale) + matrix[:, :, 3]
+            origin = _turned(matrix, origins * self.arrays.frame.scale) + matrix[:, :, 3]
             scale = self.geometries.arrays.frame.scale
             return origin / scale, _turned(matrix, shortened)
 
@@ -266,7 +265,6 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         arrays,
         geometries,
         max(wide.depth, geometries.depth),
-        moves,
         numbers,
         starts,
         starts if scene.remap is None else scene.geometries.first_face,
@@ -392,11 +390,10 @@ def _nodes(moves: Moves, threads: int) -> tuple[WideTree, np.ndarray]:
     children[:] = DONE
     children[:count] = np.where(child == EMPTY, DONE, child)
     nodes[:, 7] = 0
-    for node in range(count - 1, -1, -1):
-        for lane in np.flatnonzero(child[node] != EMPTY):
-            below = child[node, lane]
-            slip = nodes[below, 7].max() if below >= 0 else np.float32(moves.slips[-(below + 1)])
-            nodes[node, 7, lane] = slip
+    nodes[:count, 7][leaf] = moves.slips[-(child[leaf] + 1)] * (1 + 2 * U)
+    for node in np.flatnonzero((child >= 0).any(axis=1))[::-1]:
+        inner = child[node] >= 0
+        nodes[node, 7, inner] = nodes[child[node, inner], 7].max(axis=1)
     return wide, nodes
 
 

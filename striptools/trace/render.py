@@ -208,7 +208,9 @@ def _save(pictures: list[np.ndarray], target: str | Path | IO[bytes], **how: Any
         raise MissingExtraError("pictures need Pillow", remedy='pip install "striptools[trace]"') from error
     buffer = io.BytesIO()
     first, *others = (Image.fromarray(picture) for picture in pictures)
-    first.save(buffer, **how, **({"append_images": others} if others else {}))
+    if others:
+        how["append_images"] = others
+    first.save(buffer, **how)
     data = buffer.getvalue()
     return write_atomically(target, data) if isinstance(target, str | Path) else write_stream(target, data)
 
