@@ -1,13 +1,17 @@
 """Instances that share their geometry, traced: the hits of the flattened scene, and no leak inside any."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from test_instances import SCENES, load
 
 from striptools.errors import LimitError, UsageError
+from striptools.measure.aimed import Surface, aim, judge_fans
+from striptools.measure.bound import frame_rays
 from striptools.mesh.instances import Geometries, Instances, place
+from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import convert
 from striptools.trace import Tracer
@@ -20,6 +24,7 @@ from striptools.trace.instanced import (
     moves_of,
 )
 
+CHANDELIER = Path(__file__).parents[1] / "samples" / "chandelier.ply"
 KINDS = ("expanded", "compressed")
 
 
@@ -212,6 +217,51 @@ def test_no_ray_leaks_at_edges_and_vertices(crowd, resident):
     assert rays > 20000
 
 
+@pytest.mark.parametrize("resident", KINDS)
+def test_no_ray_leaks_from_outside_a_real_model(resident):
+    """Aimed at edges and vertices of the geometry, placed; certain by the ray as the walk moves it."""
+    model = load_mesh(CHANDELIER)
+    random = np.random.default_rng(11)
+    matrices = random_matrices(random, 6)
+    matrices[:, :, 3] *= 100
+    part = (np.asarray(model.positions, np.float32), model.faces)
+    scene = convert(mesh_of([part], np.zeros(6), matrices))
+    tracer, layout = (
+        Tracer(scene, device="cpu", instances="shared", resident=resident),
+        lay_out_instanced(scene),
+    )
+    kept = np.zeros(len(model.faces), bool)
+    kept[scene.remap.face] = True
+    surface = Surface(part[0], model.faces[kept])
+    bounds = np.array([part[0].min(axis=0), part[0].max(axis=0)], np.float64)
+    certain = 0
+    for k in range(len(matrices)):
+        edges = random.choice(surface.edges, 3000, replace=False)
+        vertices = random.integers(0, len(surface.vertices), 3000)
+        at = surface.positions[surface.vertices[vertices]].astype(np.float64)
+        for targets, normals, fans in (
+            (surface.edge_midpoints(edges), surface.normals_at(edges), surface.edge_fans(edges)),
+            (at, surface.normals_at(surface.corner_at(vertices)), surface.vertex_fans(vertices)),
+        ):
+            starts = aim(targets, normals, bounds, random)[0].astype(np.float64)
+            placed = place(starts, matrices[k]), place(targets, matrices[k])
+            rays = placed[0].astype(np.float32), (placed[1] - placed[0].astype(np.float32)).astype(np.float32)
+            hits = tracer.closest_hit(*rays)
+            verdicts = judge_fans(frame_rays(*moved_rays(scene, layout, *rays, k)), surface, fans)
+            certain += int(verdicts.certain.sum())
+            leaks = verdicts.certain & ~(hits.t <= verdicts.farthest)
+            assert not leaks.any(), (k, int(leaks.sum()))
+    assert certain > 20000
+
+
+def moved_rays(scene, layout, origins, directions, k):
+    """Rays in the frame of instance k, float32, as the walk moves them; t is the caller's."""
+    start, way = layout.moved(origins, directions, np.full(len(origins), k))
+    length = np.ldexp(1.0, np.frexp(np.abs(directions).max(axis=1))[1] - 1)[:, None]
+    scale = float(layout.arrays.frame.scale) / float(layout.geometries.arrays.frame.scale)
+    return start, way * (length * scale).astype(np.float32)
+
+
 def test_matrices_that_round_nothing_give_the_bits_of_the_flattened_scene():
     alike = np.stack([np.eye(4)[:3], 4 * np.eye(4)[:3], 0.125 * np.eye(4)[:3]])
     scene = convert(mesh_of([sphere()], np.zeros(3), alike))
@@ -288,15 +338,13 @@ def test_the_slip_holds_for_the_moved_ray(crowd):
     layout = lay_out_instanced(scene)
     moves, random = moves_of(scene, geometry_boxes(scene)), np.random.default_rng(5)
     matrix = scene.instances.matrix
-    inner = float(layout.geometries.arrays.frame.scale)
     worst = 0.0
     for k in range(len(matrix)):
         origins = (random.normal(size=(500, 3)) * 10 ** random.uniform(0, 3, (500, 1))).astype(np.float32)
         targets = place(scene.positions[scene.spans.vertices(int(scene.instances.geometry[k]))], matrix[k])
         directions = (targets[random.integers(0, len(targets), 500)] - origins).astype(np.float32)
-        start, way = layout.moved(origins, directions, np.full(500, k))
-        length = np.ldexp(1.0, np.frexp(np.abs(directions).max(axis=1))[1] - 1)[:, None]
-        reached = start.astype(np.float64) + way * (length * float(moves.scale) / inner)
+        start, way = moved_rays(scene, layout, origins, directions, k)
+        reached = start.astype(np.float64) + way
         off = np.abs(place_exactly(reached, matrix[k]) - (origins.astype(np.float64) + directions)).max(
             axis=1
         )
