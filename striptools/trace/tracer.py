@@ -229,7 +229,8 @@ class Tracer:
 
         def weigh(part: tuple[int, int]) -> None:
             mine = slice(*part)
-            self._layout.weigh(rays, at[mine], tuple(a[mine] for a in traced[:2]), found)
+            mine_traced = tuple(a[mine] if len(a) == len(at) else a for a in traced)
+            self._layout.weigh(rays, at[mine], mine_traced, found)
 
         in_chunks(weigh, len(at), self._weighers)
 
