@@ -178,7 +178,7 @@ def flushed(values):
 
 @np.errstate(all="ignore")
 def slow_rays(frame, origins, directions, t_max):
-    """Which are rays, their dominant axis and side, origins, scaled directions, reach and length's inverse."""
+    """Which are rays, dominant axis and side, origins, scaled directions, reach, inverse of length."""
     o, d, far = flushed(flushed(origins) * frame[0]), flushed(directions), flushed(t_max)
     is_ray = np.isfinite(o).all(axis=1) & np.isfinite(d).all(axis=1) & (d != 0).any(axis=1) & (far > 0)
     longest = np.abs(d).max(axis=1)
