@@ -1,247 +1,275 @@
-"""Packets of rays: the same hits as rays on their own, bit for bit, and packets as a slow twin makes them."""
+"""Rays in packets: the hits of rays on their own, bit for bit, and the kernel that puts them together."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import scene_of, scenes, small_scene
-from strategies import book, cube, fan, grid, sphere, stack
-from test_hoisting import loops_outside_hoisted_calls
+from rays import aimed_rays
+from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
 
+import striptools
 from striptools.errors import StriptoolsError
-from striptools.kernels.packets import FAR, HEAD, PACKET, ROW, ready_packets
+from striptools.kernels.packets import HEAD, PACKET, ROW, ready_packets
 from striptools.mesh.mesh import Mesh
+from striptools.pipeline import Options
 from striptools.trace import Tracer
+from striptools.trace import walk_packets as walk
 from striptools.trace.launch import program
+from striptools.trace.rays import Camera, camera_rays
 
-KINDS = ("camera", "parallel", "light", "surface", "aimed", "broken", "scattered")
+FIELDS = ("t", "face", "u", "v", "triangle")
+RESIDENT = ("expanded", "compressed")
+SIDE = 64
+"""Pixels across: two packets, since where rays change their dominant axis they go alone."""
+
+SHAPES = {
+    "book": lambda: book(5),
+    "cube": cube,
+    "fan": lambda: fan(30),
+    "grid": lambda: grid(6, 6),
+    "soup": lambda: soup(50, 1, 16),
+    "sphere": lambda: sphere(3),
+    "stack": lambda: stack(20),
+    "tangle": lambda: tangle(20, 60, 1),
+}
 
 
-def ball():
-    return scene_of(Mesh(*sphere(3)))
+def scene_of(mesh):
+    return striptools.convert(mesh, Options(threads=1))
 
 
-@np.errstate(all="ignore")
-def coherent_rays(scene, kind, count, seed):
-    """Rays in a row that go the same way (but for "scattered"): (origins, directions, t_max)."""
+def pictures(scene, seed):
+    """Rays of a camera in tiles and line by line, of an orthographic one, and towards a point of light."""
     random = np.random.default_rng(seed)
-    positions = scene.positions.astype(np.float64)
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    size = max(np.linalg.norm(high - low), np.abs(positions).max() * 1e-3, 1e-37)
-    corners = positions[scene.faces()]
-    picked = corners[random.integers(0, len(corners))]
-    t_max = np.full(count, np.inf)
-    eye = (low + high) / 2 + random.normal(size=3) * size
-    middle = picked.mean(axis=0)
-    across = size * 10.0 ** -random.integers(0, 4)
-    points = middle + across * random.uniform(-0.5, 0.5, (count, 3))
-    origins, directions = np.repeat(eye[None], count, axis=0), points - eye
-    if kind == "parallel":
-        way = np.eye(3)[random.integers(0, 3)] * random.choice([-1, 1]) if seed % 2 else middle - eye
-        origins, directions = points - 2 * way, np.repeat(way[None], count, axis=0)
-    elif kind == "light":
-        origins, directions, t_max = points, eye - points, np.ones(count)
-    elif kind == "surface":
-        origins = np.repeat(middle[None], count, axis=0)
-        directions = (eye - middle) / size + 0.2 * random.normal(size=(count, 3))
-    elif kind == "aimed":
-        weights = random.choice([0.0, 0.5, 1.0], (count, 2))
-        points = picked[0] + weights[:, :1] * (picked[1] - picked[0])
-        points = points + weights[:, 1:] * (1 - weights[:, :1]) * (picked[2] - points)
-        directions = points - eye
-    elif kind == "broken":
-        bad = random.random(count) < 0.3
-        directions[bad] = random.choice([np.nan, np.inf, 0.0, 1e-41], (count, 3))[bad]
-        origins[random.random(count) < 0.05, 1] = np.nan
-        t_max = random.choice([np.inf, 1.0, 0.0, -1.0, np.nan, 1e-40], count)
-    elif kind == "scattered":
-        directions = random.normal(size=(count, 3))
-    lengths = 10.0 ** random.integers(-3, 4, (count, 1))
-    return (
-        origins.astype(np.float32),
-        (directions * lengths).astype(np.float32),
-        (t_max / (lengths[:, 0] if kind == "light" else 1.0)).astype(np.float32),
-    )
+    camera = Camera.framing(scene.positions, width=SIDE, height=SIDE, up=str(random.choice(["x", "y", "z"])))
+    origins, directions = camera_rays(camera)
+    yield origins, directions, None
+    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
+    size = max(float(np.linalg.norm(high - low)), float(np.abs(scene.positions).max()) * 1e-3, 1e-30)
+    axis = int(random.integers(3))
+    plane = low + (high - low) * random.random((SIDE * SIDE, 3))
+    plane = plane[np.lexsort(plane.T)].astype(np.float32)
+    plane[:, axis] = np.float32(low[axis] - size)
+    along = np.zeros_like(plane)
+    along[:, axis] = 1
+    yield plane, along, None
+    light = (low + (high - low) * random.random(3) + size * random.normal(size=3)).astype(np.float32)
+    yield plane, light - plane, np.float32(1)
 
 
-def assert_same(tracer, origins, directions, t_max):
-    one = tracer.closest_hit(origins, directions, t_max=t_max, packets=False)
+def aimed_packets(scene, seed):
+    """Packets from one eye each, aimed exactly at corners and midpoints of edges near each other."""
+    random = np.random.default_rng(seed)
+    faces = scene.faces()
+    corners = scene.positions[faces[np.sort(random.integers(0, len(faces), 320))]].astype(np.float64)
+    target = corners[:, 0].copy()
+    target[::2] = 0.5 * (corners[::2, 0] + corners[::2, 1])
+    size = max(float(np.linalg.norm(np.ptp(scene.positions.astype(np.float64), axis=0))), 1e-30)
+    eyes = target[::PACKET] + 2 * size * random.normal(size=(10, 3))
+    origins = np.repeat(eyes, PACKET, axis=0).astype(np.float32)
+    return origins, (target - origins).astype(np.float32), None
+
+
+def assert_same(scene, rays, resident):
+    origins, directions, t_max = rays
+    tracer = Tracer(scene, device="cpu", threads=1, resident=resident)
+    alone = tracer.closest_hit(origins, directions, t_max=t_max, packets=False)
     together = tracer.closest_hit(origins, directions, t_max=t_max)
-    for name in ("t", "u", "v"):
-        bits = [getattr(hits, name).view(np.int32) for hits in (one, together)]
-        np.testing.assert_array_equal(*bits, err_msg=name)
-    np.testing.assert_array_equal(one.face, together.face)
-    np.testing.assert_array_equal(one.triangle, together.triangle)
-    np.testing.assert_array_equal(tracer.any_hit(origins, directions, t_max=t_max), one.hit)
-    return one
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(together, field), getattr(alone, field), err_msg=field)
+    np.testing.assert_array_equal(tracer.any_hit(origins, directions, t_max=t_max), alone.hit)
+    return alone
 
 
-@settings(max_examples=10)
-@given(scenes(), st.sampled_from(KINDS), st.sampled_from([1, 31, 32, 33, 200]), st.integers(0, 2**32 - 1))
-def test_packets_hit_what_single_rays_hit(given_scene, kind, count, seed):
-    scene = given_scene[1]
-    assert_same(Tracer(scene, device="cpu"), *coherent_rays(scene, kind, count, seed))
+@pytest.mark.parametrize(
+    ("shape", "resident"),
+    [*((shape, "expanded") for shape in SHAPES), ("sphere", "compressed"), ("tangle", "compressed")],
+)
+def test_pictures_are_the_same(shape, resident):
+    scene = scene_of(Mesh(*SHAPES[shape]()))
+    hits = [assert_same(scene, rays, resident).hit.sum() for rays in pictures(scene, 1)]
+    assert sum(hits) > 0
 
 
-@pytest.mark.parametrize("mesh", [sphere(3), book(9), cube(), fan(40), grid(9, 8), stack(5)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_packets_over_shapes(mesh, kind):
-    scene = scene_of(Mesh(*mesh))
-    tracer = Tracer(scene, device="cpu")
-    for seed in range(3):
-        assert_same(tracer, *coherent_rays(scene, kind, 500, seed))
+@settings(max_examples=12)
+@given(clean_meshes(), st.integers(0, 2**32 - 1))
+def test_any_mesh_has_the_same_hits(mesh, seed):
+    scene = scene_of(mesh)
+    with np.errstate(all="ignore"):
+        for rays in (*pictures(scene, seed), aimed_packets(scene, seed)):
+            assert_same(scene, rays, "expanded")
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
-@pytest.mark.parametrize("kind", ["camera", "light", "aimed"])
-def test_packets_whatever_the_scale(scale, kind):
+@settings(max_examples=3)
+@given(clean_meshes(), st.integers(0, 2**32 - 1))
+def test_any_packed_mesh_has_the_same_hits(mesh, seed):
+    scene = scene_of(mesh)
+    with np.errstate(all="ignore"):
+        for rays in (*pictures(scene, seed), aimed_packets(scene, seed)):
+            assert_same(scene, rays, "compressed")
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-6, 1.0, 1e6, 1e30])
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+def test_units_and_places_make_no_difference(unit, offset):
     positions, faces = sphere(3)
-    scene = scene_of(Mesh(positions * np.float32(scale), faces))
-    hits = assert_same(Tracer(scene, device="cpu"), *coherent_rays(scene, kind, 500, 1))
-    assert kind == "light" or hits.hit.any()
+    scene = scene_of(Mesh(((positions + offset) * unit).astype(np.float32), faces))
+    with np.errstate(all="ignore"):
+        hits = [
+            assert_same(scene, rays, "expanded").hit
+            for rays in (*pictures(scene, 2), aimed_packets(scene, 3))
+        ]
+    assert np.concatenate(hits).any()
 
 
-@pytest.mark.parametrize("away", [1e2, 1e4, 1e7])
-def test_packets_from_far_away(away):
-    scene = ball()
-    tracer = Tracer(scene, device="cpu")
-    for axis in range(3):
-        for side in (-1, 1):
-            eye = np.full(3, 0.1, np.float32)
-            eye[axis] = side * away
-            random = np.random.default_rng(axis)
-            origins = np.repeat(eye[None], 256, axis=0)
-            points = random.uniform(-0.6, 0.6, (256, 3)).astype(np.float32)
-            hits = assert_same(tracer, origins, points - origins, None)
-            assert hits.hit.mean() > 0.2
+def test_edges_and_corners_of_a_closed_mesh_let_nothing_through():
+    scene = scene_of(Mesh(*sphere(4)))
+    centre = 0.5 * (scene.low + scene.high)
+    random = np.random.default_rng(4)
+    faces = scene.faces()
+    corners = scene.positions[faces].astype(np.float64)
+    target = np.concatenate([corners[:, 0], 0.5 * (corners[:, 0] + corners[:, 1])])
+    target = target[np.lexsort(np.round(target, 1).T)]
+    inside = centre + 0.2 * random.normal(size=3)
+    origins = np.broadcast_to(inside, target.shape).astype(np.float32)
+    hits = Tracer(scene, device="cpu", threads=1).closest_hit(origins, (target - origins).astype(np.float32))
+    assert hits.hit.all()
 
 
-def test_packets_are_walked_where_rays_go_the_same_way():
-    """Or all these tests would compare single rays with single rays."""
-    scene = ball()
-    layout = Tracer(scene, device="cpu")._layout
-    rays = coherent_rays(scene, "camera", 320, 4)
-    assert ready(layout, *rays)[0] >= 1
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 257])
+def test_any_number_of_rays(count):
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions, _ = next(pictures(scene, 5))
+    assert_same(scene, (origins[:count], directions[:count], None), "expanded")
 
 
-@pytest.mark.parametrize("threads", [1, None])
-def test_packets_whatever_the_devices(threads):
-    scene = scene_of(Mesh(*grid(9, 8)))
-    rays = coherent_rays(scene, "camera", 5000, 7)
-    one = Tracer(scene, device="cpu", threads=threads).closest_hit(*rays[:2])
-    two = Tracer(scene, device="cpu", threads=1).closest_hit(*rays[:2], packets=False)
-    assert one.hit.any()
-    np.testing.assert_array_equal(one.t, two.t)
-    np.testing.assert_array_equal(one.face, two.face)
+def test_rays_that_are_none_and_rays_that_go_elsewhere():
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions, _ = next(pictures(scene, 6))
+    random = np.random.default_rng(7)
+    odd = np.array([0, np.nan, np.inf, -np.inf, 1e-45, 3e38], np.float32)
+    some = random.random(len(origins)) < 0.1
+    directions[some] = random.choice(odd, (int(some.sum()), 3))
+    other = random.random(len(origins)) < 0.01
+    directions[other] *= -1
+    reach = np.where(random.random(len(origins)) < 0.1, np.float32(-1), np.float32(np.inf)).astype(np.float32)
+    assert_same(scene, (origins, directions, reach), "expanded")
 
 
-def test_a_tree_that_runs_in_a_circle_is_an_error_to_packets_too():
-    tracer = Tracer(ball(), device="cpu")
-    layout = tracer._layout
-    nodes = layout.arrays.nodes.copy()
-    nodes[:, 6] = (
-        np.where(np.isnan(nodes[:, 0]), nodes[:, 6].view(np.int32), 0).astype(np.int32).view(np.float32)
+def test_incoherent_rays_go_alone():
+    scene = scene_of(Mesh(*sphere(3)))
+    rays = aimed_rays(scene.positions, scene.faces(), 3000, 8)
+    assert_same(scene, (*rays, None), "expanded")
+    assert packets_of(scene, *rays)[0] < 10
+
+
+def test_all_devices_take_their_share():
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions, _ = next(pictures(scene, 9))
+    one, many = (Tracer(scene, device="cpu", threads=n).closest_hit(origins, directions) for n in (1, None))
+    np.testing.assert_array_equal(one.t, many.t)
+    np.testing.assert_array_equal(one.face, many.face)
+
+
+def packets_of(scene, origins, directions, t_max=np.inf):
+    """How many packets rays make, which rays go alone, rows, the ray of each lane, and what was dropped."""
+    seen = Tracer(scene, device="cpu", threads=1)._layout.seen_by_packets
+    count = len(origins)
+    rows, at = np.zeros((count, ROW), np.float32), np.zeros((count, PACKET), np.int32)
+    alone, dropped = np.zeros(count + PACKET, np.int32), np.zeros(count, np.uint8)
+    reach = np.full(count, t_max, np.float32)
+    places = (rows, rows.view(np.int32), at, alone, dropped)
+    made, left, end = ready_packets(origins, directions, reach, 0, *seen, *places)
+    assert end == count
+    return made, alone[:left], rows[:made], at[:made], dropped
+
+
+def test_packets_bound_their_rays():
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions, _ = next(pictures(scene, 10))
+    made, _, rows, at, dropped = packets_of(scene, origins, directions)
+    assert made > 5
+    words = rows.view(np.int32)
+    for row, word, lanes in zip(rows, words, at, strict=True):
+        live = lanes >= 0
+        x, y, z, away = word[12], word[13], word[14] & 3, word[14] >> 2
+        sign = -1.0 if away else 1.0
+        o, d = origins[lanes[live]].astype(np.float64), directions[lanes[live]].astype(np.float64)
+        assert (np.abs(d[:, z]) >= np.abs(d).max(axis=1)).all()
+        assert (d[:, z] * sign > 0).all()
+        # The least and the largest slope and origin, with room to both sides.
+        for axis, slopes, starts in ((x, row[0:2], row[4:6]), (y, row[2:4], row[6:8])):
+            slope, start = d[:, axis] / np.abs(d[:, z]), o[:, axis]
+            assert slopes[0] < slope.min() <= slope.max() < slopes[1]
+            assert starts[0] < start.min() <= start.max() < starts[1]
+        ahead = o[:, z] * sign
+        assert row[9] < ahead.min() <= ahead.max() < row[8]
+        rays = row[HEAD:].reshape(8, PACKET)
+        np.testing.assert_array_equal(rays[2, live], origins[lanes[live], z])
+        assert (rays[6, ~live] == -1).all()
+    kept = np.sort(at[at >= 0])
+    assert len(np.unique(kept)) == len(kept)
+    assert (dropped[kept] == 0).all()
+
+
+def test_dropped_packets_miss_the_scene():
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions, _ = next(pictures(scene, 11))
+    aside = np.cross(directions.mean(axis=0), [0.3, 0.5, 0.8])
+    origins += (5 * aside / np.linalg.norm(aside)).astype(np.float32)
+    made, alone, *_, dropped = packets_of(scene, origins, directions)
+    assert made == 0
+    assert (np.delete(dropped, alone) == 1).all()
+    assert len(alone) < 0.6 * len(dropped)
+
+
+@pytest.mark.parametrize("resident", RESIDENT)
+@pytest.mark.parametrize("any_hit", [False, True])
+def test_the_walk_is_hoisted(resident, any_hit):
+    tracer = Tracer(scene_of(Mesh(*sphere(3))), device="cpu", threads=1, resident=resident)
+    lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), True).lower(
+        tracer._scene, np.zeros((8, ROW), np.float32)
     )
-    tracer._take(replace(layout, arrays=layout.arrays._replace(nodes=nodes)))
-    rays = coherent_rays(ball(), "camera", 64, 4)
-    with pytest.raises(StriptoolsError):
-        tracer.closest_hit(*rays[:2])
-
-
-@pytest.mark.parametrize("asked", [{}, {"any_hit": True}])
-def test_the_walk_of_packets_is_hoisted(asked):
-    tracer = Tracer(small_scene(), device="cpu")
-    rows = np.zeros((8 * len(tracer.devices), ROW), np.float32)
-    lowered = program(tracer._mesh, tracer._options(**asked), True).lower(tracer._scene, rows)
     text = lowered.compile().as_text()
     assert 'xla_cpu_small_call="true"' in text
-    assert loops_outside_hoisted_calls(text) == []
+    name, outside = "", []
+    for line in text.splitlines():
+        if started := re.match(r"(?:ENTRY )?%?(\S+) ", line):
+            name = started.group(1)
+        if " while(" in line and not re.match(r"while\S*_computation", name):
+            outside.append(name)
+    assert outside == []
 
 
-# ---- Readying packets, ray by ray in NumPy.
+def test_a_tree_without_end_is_stuck_and_no_hang():
+    scene = scene_of(Mesh(*sphere(3)))
+    tracer = Tracer(scene, device="cpu", threads=1, resident="expanded")
+    nodes = tracer._layout.arrays.nodes
+    children = nodes[0, 6].view(np.int32)
+    children[children >= 0] = 0
+    children[:] = 0
+    nodes[0, :3], nodes[0, 3:6] = -1e3, 1e3
+    tracer._take(replace(tracer._layout, arrays=tracer._layout.arrays._replace(nodes=nodes)))
+    origins, directions, _ = next(pictures(scene, 12))
+    with pytest.raises(StriptoolsError, match="did not end"):
+        tracer.closest_hit(origins, directions)
 
 
-def ready(layout, origins, directions, t_max, room=64):
-    rows, at = np.zeros((room, ROW), np.float32), np.zeros((room, PACKET), np.int32)
-    alone, dropped = np.full(len(origins) + PACKET, -7, np.int32), np.full(len(origins), 9, np.uint8)
-    places = (rows, rows.view(np.int32), at, alone, dropped)
-    live, left, begin = ready_packets(origins, directions, t_max, 0, *layout.seen_by_packets, *places)
-    return live, rows[:live], at[:live], alone[:left], dropped, begin
+def test_a_frustum_that_is_too_narrow_would_be_seen(monkeypatch):
+    scene = scene_of(Mesh(*sphere(4)))
+    meets = walk._meets
 
+    def narrow(packet, box, limit):
+        middle = 0.5 * (packet.bounds[0] + packet.bounds[1])
+        return meets(packet._replace(bounds=packet.bounds.at[1].set(middle)), box, limit)
 
-def flushed(values):
-    values = np.asarray(values, np.float32)
-    return np.where(np.abs(values) < np.finfo(np.float32).tiny, np.float32(0), values)
-
-
-@np.errstate(all="ignore")
-def slow_rays(frame, origins, directions, t_max):
-    """Which are rays, dominant axis and side, origins, scaled directions, reach, inverse of length."""
-    o, d, far = flushed(flushed(origins) * frame[0]), flushed(directions), flushed(t_max)
-    is_ray = np.isfinite(o).all(axis=1) & np.isfinite(d).all(axis=1) & (d != 0).any(axis=1) & (far > 0)
-    longest = np.abs(d).max(axis=1)
-    length = np.exp2(np.minimum(np.floor(np.log2(np.where(is_ray, longest, 1))), 126)).astype(np.float32)
-    d = flushed(d / length[:, None])
-    axis = np.argmax(np.abs(d), axis=1)
-    away = np.take_along_axis(d, axis[:, None], axis=1)[:, 0] < 0
-    reach = flushed(flushed(far * length) * frame[0])
-    return is_ray, axis, away, o, d, reach, flushed(flushed(1 / length) / frame[0])
-
-
-@settings(max_examples=40)
-@given(st.sampled_from(KINDS), st.integers(1, 200), st.integers(0, 2**32 - 1))
-def test_packets_hold_the_rays_they_say(kind, count, seed):
-    scene = ball()
-    layout = Tracer(scene, device="cpu")._layout
-    view = layout.seen_by_packets
-    rays = coherent_rays(scene, kind, count, seed)
-    live, rows, at, alone, dropped, begin = ready(layout, *rays)
-    is_ray, axis, away, o, d, reach, back = slow_rays(view.frame, *rays)
-    assert begin == count
-
-    # Each ray is in a packet, goes alone, missed, or is none.
-    inside = at[at >= 0]
-    counts = np.bincount(np.concatenate([inside, alone]), minlength=count)
-    others = np.setdiff1d(np.arange(count), alone)
-    assert counts.max(initial=0) <= 1
-    np.testing.assert_array_equal(np.sort(inside), others[dropped[others] == 0])
-    np.testing.assert_array_equal(~is_ray[others], dropped[others] == 2)
-
-    for p in range(live):
-        lanes = np.flatnonzero(at[p] >= 0)
-        members = at[p, lanes]
-        x, y, z = (int(word) & 3 for word in rows[p, 12:15].view(np.int32))
-        assert (axis[members] == z).all()
-        assert len(set(away[members])) == 1
-        sheet = rows[p, HEAD:].reshape(8, PACKET)
-        depth = d[members, z]
-        expected = [*o[members][:, [x, y, z]].T, *flushed(d[members][:, [x, y]] / depth[:, None]).T]
-        expected += [np.float32(1) / depth, reach[members], back[members]]
-        np.testing.assert_array_equal(sheet[:, lanes], np.array(expected, np.float32))
-        assert (sheet[6, at[p] < 0] == -1).all()
-        assert (np.abs(rows[p, :12]) <= FAR).all()
-
-        # The frustum holds every ray, counted the way the rays go along z.
-        sign = np.float32(-1 if away[members[0]] else 1)
-        slopes = sheet[3:5, lanes] * sign
-        assert (rows[p, [0, 2]] < slopes.min(axis=1)).all()
-        assert (rows[p, [1, 3]] > slopes.max(axis=1)).all()
-        assert (rows[p, [4, 6]] <= sheet[:2, lanes].min(axis=1)).all()
-        assert (rows[p, [5, 7]] >= sheet[:2, lanes].max(axis=1)).all()
-        assert rows[p, 8] >= (sheet[2, lanes] * sign).max()
-        assert rows[p, 9] <= (sheet[2, lanes] * sign).min()
-        assert rows[p, 10] == np.abs(depth).max()
-
-
-def test_packets_stop_where_places_end():
-    layout = Tracer(ball(), device="cpu")._layout
-    eye = np.float32([0.1, 0.2, 5])
-    random = np.random.default_rng(3)
-    points = random.uniform(-0.05, 0.05, (320, 3)).astype(np.float32)
-    rays = np.repeat(eye[None], 320, axis=0), points - eye, np.full(320, np.inf, np.float32)
-    live, _, at, alone, _, begin = ready(layout, *rays, room=3)
-    assert (live, begin) == (3, 96)
-    assert len(alone) == 0
-    np.testing.assert_array_equal(at.ravel(), np.arange(96))
+    monkeypatch.setattr(walk, "_meets", narrow)
+    program.cache_clear()
+    try:
+        with pytest.raises(AssertionError):
+            assert_same(scene, next(pictures(scene, 13)), "expanded")
+    finally:
+        program.cache_clear()
