@@ -9,7 +9,7 @@ Cost: a third of the time of weighing hits one by one.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import inlined
+from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.wide import flushed
 
 CHUNK = 64
@@ -87,7 +87,7 @@ def give_weights(room, i, turn, r, u, v):
     v[r] = room[WEIGHTS + (2 - turn) * CHUNK + i]
 
 
-@njit(cache=True, nogil=True, no_cfunc_wrapper=True)
+@kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
 ):
