@@ -11,7 +11,8 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
-from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
+from striptools.kernels.weighing import weigh_hits
+from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.object_split import split_objects
 from striptools.trace.box import MARGIN
 from striptools.trace.counters import Counters
