@@ -130,7 +130,7 @@ class Judge:
             _tell(rays.name, hits, exact, wrong, leak),
         )
 
-    def _check_reported(self, frames: RayFrames, hits: Hits) -> "_Reported":
+    def _check_reported(self, frames: RayFrames, hits: Hits) -> "Reported":
         """Rule 1: each reported face by itself."""
         ray = np.flatnonzero(hits.hit)
         face = hits.face[ray]
@@ -144,7 +144,7 @@ class Judge:
             known &= self._row_of_face[face] >= 0
             corners = self.oracle.positions[self.oracle.faces[face]]
             pairs = self.oracle.judge(frames, ray, face)
-        return _compare_reported(frames, ray, hits, pairs, corners, known)
+        return compare_reported(frames, ray, hits, pairs, corners, known)
 
     def _certain_reach(
         self, rays: RaySet, frames: RayFrames, exact: OracleHits | None
@@ -217,7 +217,7 @@ class Judge:
 
 
 @dataclass(frozen=True)
-class _Reported:
+class Reported:
     """The reported hits by themselves, (r,) each; rays that miss have no error."""
 
     valid: np.ndarray
@@ -234,9 +234,9 @@ class _Reported:
         return greatest[0], greatest[1], greatest[2], greatest[3]
 
 
-def _compare_reported(
+def compare_reported(
     frames: RayFrames, ray: np.ndarray, hits: Hits, pairs: Pairs, corners: np.ndarray, known: np.ndarray
-) -> _Reported:
+) -> Reported:
     t, u, v = (column[ray].astype(np.float64) for column in (hits.t, hits.u, hits.v))
     with np.errstate(all="ignore"):
         t_error = np.abs(t - pairs.t)
@@ -250,7 +250,7 @@ def _compare_reported(
     fine = known & pairs.possible & (t > 0) & (t_ratio <= 1) & (uv_ratio <= 1)
     fine &= (u >= 0) & (v >= 0) & (u + v <= 1 + gamma(8))
     columns = (fine, pairs.t_bound, t_error, t_ratio, np.hypot(aside, along), uv_ratio)
-    return _Reported(*(_spread(column, ray, len(hits.t)) for column in columns))
+    return Reported(*(_spread(column, ray, len(hits.t)) for column in columns))
 
 
 def _spread(values: np.ndarray, ray: np.ndarray, count: int) -> np.ndarray:
