@@ -53,6 +53,7 @@ class Case:
         outside: (r,) bool, the rays beyond the row's limit; None for none.
         outside_misses: They have to miss; else they may answer anything that is finite.
         known: The answers, where every face cannot be tried for every ray.
+        flushed: Some rays have denormal components, and are judged as the row's limit says: zeros for them.
         detail: Where above 0, the finest detail of a source in float64: what is rounded by more is beyond the
             row's limit.
     """
@@ -63,6 +64,7 @@ class Case:
     outside: np.ndarray | None = None
     outside_misses: bool = True
     known: Known | None = None
+    flushed: bool = False
     detail: float = 0.0
 
 
@@ -354,19 +356,31 @@ def _tangents(mesh: Mesh, random: np.random.Generator) -> tuple[np.ndarray, np.n
 
 
 def _large_t(quick: bool) -> Iterator[Case]:
-    """t of 1e30 to 1e38, by directions as short as float32 has them."""
+    """t of 1e30 to 1e38."""
+    case = aimed_case(moved(ball(), 1e15))
+    longest = np.abs(case.directions).max(axis=1, keepdims=True)
+    yield replace(case, directions=(case.directions / longest * np.float32(1e-22)).astype(np.float32))
+
+
+def _denormal_components(quick: bool) -> Iterator[Case]:
+    """Directions of length 1e-36, with denormals among their components, and origins of which some are."""
     case = aimed_case(ball())
-    for length in (1e-30, 1e-36):
-        yield replace(case, directions=(case.directions * np.float32(length)).astype(np.float32))
+    yield replace(case, directions=(case.directions * np.float32(1e-36)).astype(np.float32), flushed=True)
+    yield replace(aimed_case(moved(ball(), 1e-37)), flushed=True)
+
+
+def _t_underflows(quick: bool) -> Iterator[Case]:
+    case = aimed_case(ball())
+    largest = np.abs(case.directions).max(axis=1, keepdims=True)
+    yield replace(case, directions=(case.directions / largest * np.float32(3e38)).astype(np.float32))
 
 
 def _t_overflows(quick: bool) -> Iterator[Case]:
     """Hits at t beyond float32: 1e4 units away along directions of length 1e-37."""
     mesh = moved(ball(), 1e3)
     case = from_afar(mesh, 10.0)
-    with np.errstate(under="ignore"):
-        directions = case.directions / np.abs(case.directions).max(axis=1, keepdims=True) * np.float32(2e-38)
-    yield replace(case, directions=to_float32(directions), outside=np.ones(RAYS, bool))
+    longest = np.abs(case.directions).max(axis=1, keepdims=True)
+    yield replace(case, directions=(case.directions / longest * np.float32(2e-38)).astype(np.float32), flushed=True)
 
 
 def _no_rays(quick: bool) -> Iterator[Case]:
@@ -528,12 +542,20 @@ def _off(power: int) -> Row:
     )
 
 
+FLUSHED = "components below 2^-126 count as zero"
+END_OF_RANGE = "a t, or unit of t, beyond float32's normal range is told at the end of the range"
 TOO_SHORT = "a direction whose components are all below 2^-126 counts as zero, and hits nothing"
 NO_RAY = "a ray with a component that is not finite, or with a direction of zero, hits nothing"
 
 ROWS: tuple[Row, ...] = (
     *(_scaled(power) for power in (-30, -20, -10, -5, 5, 10, 20, 30)),
-    Row("scale 1e-37", "coordinates that begin to be denormal", _meshes(lambda: moved(ball(), 1e-37))),
+    Row(
+        "scale 1e-37, and short directions",
+        "some components are denormal",
+        _denormal_components,
+        expected=LIMIT,
+        limit=FLUSHED,
+    ),
     Row("scale 3e38", "extents overflow", _meshes(lambda: moved(ball(), 3e38))),
     *(_off(power) for power in (2, 4, 6)),
     Row(
@@ -550,22 +572,22 @@ ROWS: tuple[Row, ...] = (
         expected=LIMIT,
         limit="positions are float32; what rounding changes is told by Report.largest_rounding",
     ),
-    Row("survey on a planet", "float64 detail far from zero", _survey, on_grid=LIMIT, limit="a grid's bound"),
-    Row("denormal coordinates", "XLA flushes denormals", _meshes(lambda: moved(ball(), 1e-40)), expected=LIMIT),
+    Row("survey on a planet", "float64 detail far from zero", _survey),
+    Row("denormal coordinates", "XLA flushes denormals", _meshes(lambda: moved(ball(), 1e-40)), expected=ERROR),
     Row(
         "some denormal coordinates",
         "a coordinate that is flushed beside ones that are not",
         _meshes(lambda: joined(ball(), moved(ball(), 1e-40))),
-        on_grid=KEPT,
     ),
-    Row("slivers of aspect 1e9", "areas of nothing but rounding", _meshes(lambda: slivers_at_zero(60, 0))),
-    Row("needles of aspect 1e6", "signs of noise", _meshes(lambda: needles(80, 1e6, 1, cap=False))),
+    Row("slivers of aspect 1e9", "areas of nothing but rounding", _meshes(lambda: slivers_at_zero(60, 0)), on_grid=ERROR),
+    Row("needles of aspect 1e6", "signs of noise", _meshes(lambda: needles(80, 1e6, 1, cap=False)), on_grid=ERROR),
     Row("caps of aspect 1e6", "signs of noise", _meshes(lambda: needles(80, 1e6, 2, cap=True))),
     Row("needles of aspect 1e3", "thin, and certain", _meshes(lambda: needles(80, 1e3, 3, cap=False))),
     Row("coincident, coplanar and duplicate faces", "ties: the least face", _coincident),
     Row("fan of 1e5 faces at a vertex", "a hub's rays have as many candidates", _fan),
     Row("axis rays, -0.0 and denormals", "0 * inf, and the sides of boxes", _axis_rays),
-    Row("huge directions", "lengths overflow", _with_directions(lambda d: d * np.float32(1e37))),
+    Row("huge directions", "lengths overflow", _with_directions(lambda d: d * np.float32(1e35))),
+    Row("t below 2^-126", "t underflows", _t_underflows, expected=LIMIT, limit=END_OF_RANGE),
     Row("short directions", "lengths underflow", _with_directions(lambda d: d * np.float32(1e-30))),
     Row("zero directions", "0 / 0", _zero_directions, expected=LIMIT, limit=NO_RAY),
     Row("denormal directions", "flushed to zero", _denormal_directions, expected=LIMIT, limit=TOO_SHORT),
@@ -578,7 +600,7 @@ ROWS: tuple[Row, ...] = (
         "t overflows",
         _t_overflows,
         expected=LIMIT,
-        limit="a hit at a t that float32 does not hold is none",
+        limit=END_OF_RANGE,
     ),
     *(
         Row(f"origins 1e{power} diagonals away", "the bound grows with the distance", make)

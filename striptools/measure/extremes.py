@@ -13,6 +13,7 @@ over the scene's declared bound. 1 would be a bound that is met; above it is a v
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,9 +22,9 @@ import numpy as np
 from striptools.errors import StriptoolsError
 from striptools.measure.aimed import Surface
 from striptools.measure.arithmetic import Probe, probe_arithmetic
-from striptools.measure.bound import RayFrames, beyond_box, frame_rays
+from striptools.measure.bound import RayFrames, beyond_box, frame_rays, judge_pairs, shear_points
 from striptools.measure.exact import exact_pair
-from striptools.measure.extreme_rows import ERROR, KEPT, LIMIT, ROWS, Case, Row, aimed_case
+from striptools.measure.extreme_rows import ERROR, KEPT, LARGEST, LIMIT, ROWS, Case, Row, aimed_case
 from striptools.measure.judgement import Judge, compare_reported
 from striptools.measure.oracle import Oracle
 from striptools.measure.ray_sets import RaySet
@@ -39,6 +40,7 @@ from striptools.trace.hit import Hits
 EXACT_PAIRS = 400
 """Pairs of a ray and a face that integers decide, a case and precision: tens of microseconds each."""
 
+LEAST_NORMAL = float(np.finfo(np.float32).tiny)
 LONGEST_ERROR = 400
 VIOLATED = "VIOLATED"
 FILE_RAYS = 192
@@ -281,10 +283,16 @@ class CaseJudge:
         self.judged = np.flatnonzero(~outside)
         self.outside = np.flatnonzero(outside)
         with np.errstate(all="ignore"):
-            self.length = _power_below(np.abs(case.directions[self.judged].astype(np.float64)).max(axis=1))
-            self.origins = (case.origins[self.judged] * self.scale).astype(np.float32)
-            self.directions = (case.directions[self.judged] * self.length[:, None]).astype(np.float32)
+            directions = self._flushed(case.directions[self.judged])
+            self.length = _power_below(np.abs(directions).max(axis=1))
+            self.origins = (self._flushed(case.origins[self.judged]) * self.scale).astype(np.float32)
+            self.directions = (directions * self.length[:, None]).astype(np.float32)
         self._judge: Judge | None = None
+
+    def _flushed(self, values: np.ndarray) -> np.ndarray:
+        """In float64; with zeros for denormals, where the case says that it has them."""
+        flush = self.case.flushed & (np.abs(values) < LEAST_NORMAL)
+        return np.where(flush, 0.0, values.astype(np.float64))
 
     def outcome(self, hits: Hits) -> Outcome:
         """What these hits come to."""
@@ -292,20 +300,39 @@ class CaseJudge:
         move, moved = self._moves()
         if flaw or moved:
             return Outcome(VIOLATED, move_ratio=move, detail=flaw or moved)
-        judged = self._judged_hits(hits)
+        judged, at_the_end = self._judged_hits(hits)
         found = self._judge_known(judged) if self.case.known is not None else self._judge_all(judged)
-        limit = len(self.outside) > 0 or 0 < self.case.detail < self.report.largest_rounding
+        limit = len(self.outside) > 0 or self.case.flushed or at_the_end
+        limit |= 0 < self.case.detail < self.report.largest_rounding
         if found.verdict == KEPT and limit:
             found = replace(found, verdict=LIMIT)
         return replace(found, move_ratio=move)
 
-    def _judged_hits(self, hits: Hits) -> Hits:
-        """The hits of rays within the limits, in the frame; t in float64."""
+    def _judged_hits(self, hits: Hits) -> tuple[Hits, bool]:
+        """The hits of rays within the limits, in the frame, t in float64; and whether a t is at its end.
+
+        Where it is, rightly, the t of the point that u and v say stands for it.
+        """
         at = self.judged
         with np.errstate(invalid="ignore"):
             t = hits.t[at].astype(np.float64) * (self.scale / self.length)
         t = np.where(hits.hit[at], t, np.inf)
-        return Hits(t, hits.face[at], hits.u[at], hits.v[at], hits.triangle[at])  # pyright: ignore[reportArgumentType]
+        ended = np.flatnonzero(hits.hit[at] & ((hits.t[at] <= LEAST_NORMAL) | (hits.t[at] >= LARGEST)))
+        if len(ended):
+            t[ended] = self._within_range(hits, ended, t[ended])
+        judged = Hits(t, hits.face[at], hits.u[at], hits.v[at], hits.triangle[at])  # pyright: ignore[reportArgumentType]
+        return judged, len(ended) > 0
+
+    def _within_range(self, hits: Hits, ended: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """What t, in the frame, at the ends of float32's range stand for; as they are where they are wrong."""
+        frames, at = frame_rays(self.origins, self.directions), self.judged[ended]
+        weights = np.stack([1.0 - hits.u[at] - hits.v[at], hits.u[at], hits.v[at]], axis=1)
+        points = (weights[:, :, None] * self.source.positions[self.source.faces[hits.face[at]]]).sum(axis=1)
+        meant = shear_points(frames, ended, points[:, None])[:, 0, 2] / frames.depth[ended]
+        unit = self.length[ended] / self.scale
+        above = (hits.t[at] >= LARGEST) & ((meant >= t * (1 - 1e-6)) | (unit >= 2.0**128))
+        below = (hits.t[at] <= LEAST_NORMAL) & ((meant <= t * (1 + 1e-6)) | (unit < LEAST_NORMAL))
+        return np.where(above | below, meant, t)
 
     def _beyond_limit(self, hits: Hits) -> str:
         if self.case.outside_misses and hits.hit[self.outside].any():
@@ -350,7 +377,7 @@ class CaseJudge:
             VIOLATED if flaw else KEPT,
             max(result.max_t_ratio, exactly),
             result.max_uv_ratio,
-            box_need=_box_need(frames, ray, corners),
+            box_need=self._box_need(frames, ray, hits),
             detail=flaw,
         )
 
@@ -375,6 +402,14 @@ class CaseJudge:
                 return f"ray {found.ray[k]} hits face {found.face[k]} exactly, which float64 calls impossible"
         return ""
 
+    def _box_need(self, frames: RayFrames, ray: np.ndarray, hits: Hits) -> float:
+        """The most that a traced box had to be wider, in 2^-24 of the largest coordinate of ray and scene."""
+        if len(ray) == 0:
+            return 0.0
+        corners = self.scene.positions[self.scene.faces()[hits.triangle[ray]]] * self.scale
+        largest = np.maximum(np.abs(frames.origins[ray]).max(axis=1), 1.0)
+        return float((beyond_box(frames, ray, corners) / largest).max() * 2.0**24)
+
     def _judge_known(self, hits: Hits) -> Outcome:
         """Judge by the one face that each ray may report."""
         assert self.case.known is not None
@@ -386,15 +421,13 @@ class CaseJudge:
         frames = frame_rays(self.origins, self.directions)
         ray = np.flatnonzero(face >= 0)
         corners = np.asarray(self.source.positions, np.float64)[self.source.faces[face[ray]]]
-        from striptools.measure.bound import judge_pairs
-
         pairs = judge_pairs(frames, ray, corners, self.bound)
         reported = compare_reported(frames, ray, hits, pairs, corners, np.ones(len(ray), bool))
         exactly, flaw = _compare_exactly(frames, ray, corners, hits, pairs.t_bound)
         if not reported.valid[ray].all():
             flaw = "a hit beyond its bound"
         _, t_ratio, _, uv_ratio = reported.extremes(np.isin(np.arange(len(face)), ray))
-        need = _box_need(frames, ray, corners)
+        need = self._box_need(frames, ray, hits)
         return Outcome(VIOLATED if flaw else KEPT, max(t_ratio, exactly), uv_ratio, 0.0, need, flaw)
 
 
@@ -429,7 +462,7 @@ def _compare_exactly(
         exact = exact_pair(frames.origins[r], frames.directions[r], corners[k]).clamped
         if exact is None:
             continue
-        error = abs(float(exact - _fraction(hits.t[r])))
+        error = abs(float(exact - Fraction(float(hits.t[r]))))
         if error > t_bound[k]:
             return np.inf, f"ray {r}: t errs by {error:.4g}, its bound is {t_bound[k]:.4g}"
         largest = max(largest, error / t_bound[k])
@@ -440,11 +473,3 @@ def _fraction(value: float) -> Any:
     from fractions import Fraction
 
     return Fraction(float(value))
-
-
-def _box_need(frames: RayFrames, ray: np.ndarray, corners: np.ndarray) -> float:
-    """The most that a box had to be widened, in units of 2^-24 of the largest coordinate of ray and scene."""
-    if len(ray) == 0:
-        return 0.0
-    largest = np.maximum(np.abs(frames.origins[ray]).max(axis=1), 1.0)
-    return float((beyond_box(frames, ray, corners) / largest).max() * 2.0**24)

@@ -182,17 +182,20 @@ class Judge:
         faced = (candidates.pairs.side[doubtful] != 0) & (row >= 0)
         at_edge = np.flatnonzero(faced & (near.sum(axis=1) == 1))
         at_vertex = np.flatnonzero(faced & (near.sum(axis=1) == 2))
-        # The edge opposite corner i starts at corner i + 1; two near edges meet at the third corner.
+        # The edge opposite corner i starts at corner i + 1; two near edges meet at the third corner. All faces
+        # round a vertex ask for the same fan, which is judged once a ray: hubs have a hundred thousand.
         half_edges = 3 * row[at_edge] + (np.argmax(near[at_edge], axis=1) + 1) % 3
         corner = np.argmin(near[at_vertex], axis=1)
         places = np.searchsorted(self.surface.vertices, self.surface.faces[row[at_vertex], corner])
-        for index, fans in (
-            (at_edge, self.surface.edge_fans(half_edges)),
-            (at_vertex, self.surface.vertex_fans(places)),
+        for index, target, fans_of in (
+            (at_edge, half_edges, self.surface.edge_fans),
+            (at_vertex, places, self.surface.vertex_fans),
         ):
-            some = _frames_of(frames, candidates.ray[doubtful[index]])
-            found = judge_fans(some, self.surface, fans, self.oracle.error_bound)
-            verdict[index], reach[index] = found.certain, found.farthest
+            asked = np.stack([candidates.ray[doubtful[index]], target], axis=1)
+            asked, pair = np.unique(asked, axis=0, return_inverse=True)
+            ray, fans, pair = asked[:, 0], fans_of(asked[:, 1]), pair.reshape(-1)
+            found = judge_fans(_frames_of(frames, ray), self.surface, fans, self.oracle.error_bound)
+            verdict[index], reach[index] = found.certain[pair], found.farthest[pair]
         return verdict, reach
 
     def _matches_source(self, hits: Hits, candidates: Candidates) -> np.ndarray:

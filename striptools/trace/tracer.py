@@ -45,6 +45,12 @@ class Tracer:
     of least t, then of least source face. A ray with a component that is not finite, or with a direction of
     zero, hits nothing.
 
+    Numbers below 2**-126 count as zero, in origins and in directions. A hit whose t, or whose unit of t (the
+    size of the scene over that of the direction), is beyond float32's normal range is told at the end of the
+    range, 2**-126 or the largest number. Origins beyond 2**40 times the
+    largest coordinate of the scene get some finite answer. Everything else is within the bound of
+    `measure.bound`.
+
     Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
@@ -74,7 +80,8 @@ class Tracer:
     Raises:
         UsageError: There is no such device, hierarchy or residency, or not both of them together, or the
             scene has instances, which are not traced compressed yet.
-        LimitError: All instances have more triangles than a mesh may have.
+        LimitError: All instances have more triangles than a mesh may have, or the scene has no coordinate of
+            2**-126 or more.
     """
 
     def __init__(

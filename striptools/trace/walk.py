@@ -34,7 +34,7 @@ from jaxtyping import Int32
 
 from striptools.trace.box import Slab, slab_of
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
+from striptools.trace.numerics import folded, in_range, index, larger, power_of_two_below, quotient, smaller
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, shear_of
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 
@@ -581,5 +581,5 @@ def _result(
         t, name, count = best.t, best.name, best.counted
     else:
         t, name, count = best.nearest, closest_name(best, any_hit, scene), jnp.zeros(0, jnp.int32)
-    t = jnp.where(name < 0, jnp.float32(jnp.inf), t * ray.t_unit)
+    t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(t * ray.t_unit))
     return t, jnp.where(place.child != DONE, STUCK, name), count
