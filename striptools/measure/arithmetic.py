@@ -40,9 +40,7 @@ def probe_arithmetic() -> tuple[Probe, ...]:
         return (_contraction(), _reassociation(), _division(), _flushing())
 
 
-def differs(
-    program: Callable[..., jax.Array], expected: np.ndarray, *arguments: np.ndarray
-) -> bool:
+def differs(program: Callable[..., jax.Array], expected: np.ndarray, *arguments: np.ndarray) -> bool:
     """Whether a compiled program gives other bits than expected; zeros of both signs are one."""
     found = np.asarray(jax.jit(program)(*arguments)) + np.float32(0)
     return bool((found.view(np.int32) != (expected + np.float32(0)).view(np.int32)).any())

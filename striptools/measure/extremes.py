@@ -33,9 +33,12 @@ from striptools.mesh.io import READ_FORMATS, load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options, Report, convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
-from striptools.reducem.scene import Scene
+from striptools.reducem.scene import Remap, Scene
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits
+
+CHUNK = 1 << 18
+"""Faces handled at a time where a mesh may be large."""
 
 EXACT_PAIRS = 400
 """Pairs of a ray and a face that integers decide, a case and precision: tens of microseconds each."""
@@ -247,6 +250,7 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
         if (hit != hits.hit).any():
             outcome = replace(outcome, verdict=VIOLATED, detail="any hits are not closest hits")
         outcomes.append(outcome)
+        del traced  # not beside the next one, which may be as large
     return outcomes
 
 
@@ -347,17 +351,24 @@ class CaseJudge:
         if self.scene.origin is None and declared == 0.0:
             declared = np.sqrt(3.0) * self.report.largest_rounding
         declared *= self.scale
-        source = np.asarray(self.case.mesh.positions, np.float64)
-        corners = source[self.case.mesh.faces[remap.face]] - (
-            0.0 if self.scene.origin is None else self.scene.origin
-        )
-        turned = (np.arange(3) + remap.rotation[:, None].astype(np.int64)) % 3
-        ours = self.scene.positions[self.scene.faces()].astype(np.float64)
-        theirs = np.take_along_axis(corners, turned[:, :, None], axis=1)
-        away = np.linalg.norm((ours - theirs) * self.scale, axis=2).max(initial=0.0)
+        away = self._farthest_move(remap) * self.scale
         if not away <= declared * (1 + 2.0**-40):
             return 0.0, f"a vertex moved by {away / self.scale:.4g}, declared are {declared / self.scale:.4g}"
         return float(away / declared) if declared else 0.0, ""
+
+    def _farthest_move(self, remap: Remap) -> float:
+        """The farthest that a corner of a traced face is from the loaded one, in the model's unit."""
+        source, faces = self.case.mesh, self.scene.faces()
+        origin = 0.0 if self.scene.origin is None else self.scene.origin
+        farthest = 0.0
+        for begin in range(0, len(faces), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            theirs = source.positions[source.faces[remap.face[part]]].astype(np.float64) - origin
+            turned = (np.arange(3) + remap.rotation[part, None].astype(np.int64)) % 3
+            theirs = np.take_along_axis(theirs, turned[:, :, None], axis=1)
+            away = self.scene.positions[faces[part]].astype(np.float64) - theirs
+            farthest = max(farthest, float(np.linalg.norm(away * self.scale, axis=2).max()))
+        return farthest / self.scale
 
     def _judge_all(self, hits: Hits) -> Outcome:
         """Judge by every face of the source, in float64 and then in integers."""
