@@ -10,11 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from striptools.trace.device import quiet_jax
-from striptools.trace.numerics import rounded
+from striptools.trace.numerics import quotient, rounded
 
 PROBES = 4096
 
@@ -52,7 +51,7 @@ def _numbers(count: int) -> list[np.ndarray]:
 
 
 def _contraction() -> Probe:
-    """a b - c d by rounded products; contracted, a b - b a is what is left of a rounding, and not zero."""
+    """Contracted, a b - b a is what is left of a rounding, and not zero; a product that is rounded is not."""
     a, b = _numbers(2)
     zero = np.zeros(PROBES, np.float32)
     taken = differs(lambda a, b: a * b - b * a, zero, a, b) or differs(
@@ -74,9 +73,7 @@ def _reassociation() -> Probe:
 
 
 def _division() -> Probe:
-    """a / b by a loop's invariant b may become a product with its reciprocal; `numerics.quotient` may not."""
-    from striptools.trace.numerics import quotient
-
+    """Divided by a loop's invariant, a may be multiplied by its reciprocal; by `quotient` it is not."""
     a, b = _numbers(2)
 
     def by_invariant(divide: Callable[[jax.Array, jax.Array], jax.Array]) -> Callable[..., jax.Array]:

@@ -47,9 +47,9 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    weights whose point of the source's face lies within D, so it is within D of the source's plane, of unit
    normal n, and along m = (S_x, S_y, 1) as far as D / |n m|. From n = (-grad z, 1 + S grad z) / k follows k
    = 1 / |n m| = sqrt(|grad z|^2 + (1 + S grad z)^2), and |d| |t - t_exact| <= D |m| / |n m| = D / |cos|,
-   where there is no rounding. The last rounding terms are those of the sum itself (a_z, 1/d_z, three products, four
-   sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for products that
-   underflow.
+   where there is no rounding. The last rounding terms are those of the sum itself (a_z, 1/d_z, three
+   products, four sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for
+   products that underflow.
 7. u and v come from the same weights. Weights of one sign make sum U_i p_i / det a point of the moved face,
    within stray = sum rho_i (|p_i| + delta_v) / det_low of the ray; u and v have four more roundings. So the
    point (1-u-v) v0 + u v1 + v v2 of the source's corners lies within delta_v + min(stray, max |p_i|) +
@@ -57,9 +57,10 @@ with multiplications by a reciprocal instead of divisions, fused or not.
 8. How they add up. **The hit point, everywhere**: the point of face, u and v on the source lies within
    lateral + sqrt(3) (gamma_16 M + D) of o + t d (7; sqrt(3) for z along the ray), and within D of the traced
    one, whatever the ray: `hit_point_bound`. **t, per ray**: 6, that is D over the cosine and the rounding's
-   part. D itself, a scene's `error_bound`, is the sum of what moved a vertex: welding, rounding from doubles (sqrt(3)
-   of the largest), half a cell on each axis of a grid (sqrt(3) / 2 cells, `reducem.quantize`); none of them
-   knows of the others.
+   part. D itself, a scene's `error_bound`, is the sum of what moved a vertex: welding, rounding from doubles
+   (sqrt(3) of the largest), half a cell on each axis of a grid (sqrt(3) / 2 cells, `reducem.quantize`);
+   none of them knows of the others. (Doubles without an origin of their own are rounded first: then the
+   float32 mesh counts as the source, and the rounding is told by the conversion's report.)
 9. A box. With the tracer's own order of operations a sheared coordinate near 0 has four roundings (a_x, a_z,
    S, the product), so it moves by at most gamma_4 M, M <= 2 L with L the largest coordinate of ray and scene;
    a face whose corners straddle the ray after that lies within gamma_4 M of it in x and in y. A certain face

@@ -1,4 +1,4 @@
-"""The table of extremes: every row of `extreme_rows`, through every mode of tracing, against the exact answer.
+"""The table of extremes: every row of `extreme_rows` through every mode of tracing, against the exact answer.
 
 How a case is judged. It is converted once for each precision and traced by each mode. Source, rays and hits
 are taken into the frame in which the scene's largest coordinate and each direction's are 1 to 2, by powers of
@@ -28,9 +28,7 @@ from striptools.measure.extreme_rows import ERROR, KEPT, LARGEST, LIMIT, ROWS, C
 from striptools.measure.judgement import Judge, compare_reported
 from striptools.measure.oracle import Oracle
 from striptools.measure.ray_sets import RaySet
-from striptools.mesh.clean import clean
 from striptools.mesh.io import READ_FORMATS, load_mesh
-from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options, Report, convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Remap, Scene
@@ -230,7 +228,7 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
     """The outcomes of modes that share a scene."""
     try:
         scene, report = convert_with_report(case.mesh, modes[0].options)
-    except StriptoolsError as error:
+    except Exception as error:  # a crash is what the table is there to find
         return [_refused(error)] * len(modes)
     judge = CaseJudge(case, scene, report)
     outcomes, first = [], None
@@ -239,7 +237,7 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
             traced = tracer(scene, mode)
             hits = traced.closest_hit(case.origins, case.directions)
             hit = traced.any_hit(case.origins, case.directions)
-        except StriptoolsError as error:
+        except Exception as error:  # a crash is what the table is there to find
             outcomes.append(_refused(error))
             continue
         outcome = outcomes[0] if first is not None and _equal(first, hits) else judge.outcome(hits)
@@ -254,10 +252,11 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
     return outcomes
 
 
-def _refused(error: StriptoolsError) -> Outcome:
+def _refused(error: Exception) -> Outcome:
     line = str(error)
-    clear = "\n" not in line and 0 < len(line) < LONGEST_ERROR
-    return Outcome(ERROR if clear else VIOLATED, detail=line[:LONGEST_ERROR])
+    clear = isinstance(error, StriptoolsError) and "\n" not in line and 0 < len(line) < LONGEST_ERROR
+    detail = line if isinstance(error, StriptoolsError) else f"{type(error).__name__}: {line}"
+    return Outcome(ERROR if clear else VIOLATED, detail=detail[:LONGEST_ERROR])
 
 
 def _equal(one: Hits, other: Hits) -> bool:
@@ -328,7 +327,7 @@ class CaseJudge:
         return judged, len(ended) > 0
 
     def _within_range(self, hits: Hits, ended: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """What t, in the frame, at the ends of float32's range stand for; as they are where they are wrong."""
+        """What t at the ends of float32's range stand for, in the frame; wrong ones stay as they are."""
         frames, at = frame_rays(self.origins, self.directions), self.judged[ended]
         weights = np.stack([1.0 - hits.u[at] - hits.v[at], hits.u[at], hits.v[at]], axis=1)
         points = (weights[:, :, None] * self.source.positions[self.source.faces[hits.face[at]]]).sum(axis=1)

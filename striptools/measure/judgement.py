@@ -182,8 +182,7 @@ class Judge:
         faced = (candidates.pairs.side[doubtful] != 0) & (row >= 0)
         at_edge = np.flatnonzero(faced & (near.sum(axis=1) == 1))
         at_vertex = np.flatnonzero(faced & (near.sum(axis=1) == 2))
-        # The edge opposite corner i starts at corner i + 1; two near edges meet at the third corner. All faces
-        # round a vertex ask for the same fan, which is judged once a ray: hubs have a hundred thousand.
+        # The edge opposite corner i starts at corner i + 1; two near edges meet at the third corner.
         half_edges = 3 * row[at_edge] + (np.argmax(near[at_edge], axis=1) + 1) % 3
         corner = np.argmin(near[at_vertex], axis=1)
         places = np.searchsorted(self.surface.vertices, self.surface.faces[row[at_vertex], corner])
@@ -191,6 +190,7 @@ class Judge:
             (at_edge, half_edges, self.surface.edge_fans),
             (at_vertex, places, self.surface.vertex_fans),
         ):
+            # All faces round a vertex ask for its fan, and hubs have a hundred thousand: judge it once a ray.
             asked = np.stack([candidates.ray[doubtful[index]], target], axis=1)
             asked, pair = np.unique(asked, axis=0, return_inverse=True)
             ray, fans, pair = asked[:, 0], fans_of(asked[:, 1]), pair.reshape(-1)
@@ -240,6 +240,16 @@ class Reported:
 def compare_reported(
     frames: RayFrames, ray: np.ndarray, hits: Hits, pairs: Pairs, corners: np.ndarray, known: np.ndarray
 ) -> Reported:
+    """Compare hits, of the rays (k,) `ray`, with what is said of the pairs that they report.
+
+    Args:
+        frames: Of all rays.
+        ray: Which rays hit.
+        hits: Of all rays.
+        pairs: (k,), of each hit's ray and face.
+        corners: (k, 3, 3) float64 of those faces.
+        known: (k,) bool, whether the face is one that may be reported at all.
+    """
     t, u, v = (column[ray].astype(np.float64) for column in (hits.t, hits.u, hits.v))
     with np.errstate(all="ignore"):
         t_error = np.abs(t - pairs.t)
