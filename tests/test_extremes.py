@@ -167,9 +167,11 @@ def test_any_hits_and_modes_that_differ_are_violations() -> None:
     def blind(scene: striptools.Scene, mode: Mode) -> Blind:
         return Blind(make_tracer(scene, mode), lambda hits: hits)
 
-    def late(scene: striptools.Scene, mode: Mode) -> Faulty:
+    def later(hits: Hits) -> Hits:
         # Within the bound, but not the same bits.
-        later = lambda h: changed(h, a_hit(h), t=np.nextafter(h.t[a_hit(h)], np.float32(np.inf)))
+        return changed(hits, a_hit(hits), t=np.nextafter(hits.t[a_hit(hits)], np.float32(np.inf)))
+
+    def late(scene: striptools.Scene, mode: Mode) -> Faulty:
         return Faulty(make_tracer(scene, mode), later if mode is MODES[2] else lambda hits: hits)
 
     assert "any hits" in run_row(ONE_BALL, MODES[:1], tracer=blind).outcomes[0].detail
@@ -336,12 +338,12 @@ def test_a_scene_of_nothing_but_denormals_is_refused() -> None:
 @pytest.mark.parametrize("asked", [mode.tracer for mode in MODES[:3]], ids=[m.name for m in MODES[:3]])
 def test_t_ends_where_float32_does(asked: dict) -> None:
     tracer = Tracer(convert(ball()), **asked)
-    way = np.array([[0.1, 0.05, -1]], np.float32)
-    long, short = way * np.float32(1e38), way * np.float32(2e-38)
-    assert tracer.closest_hit(-way, long).t[0] == np.finfo(np.float32).tiny
-    assert tracer.closest_hit(-way * 100, short).t[0] == np.finfo(np.float32).max
-    assert tracer.all_hits(-way, long, k=2).t[0, 0] == np.finfo(np.float32).tiny
-    many = np.tile(-way, (64, 1)), np.tile(long, (64, 1))
+    near, far = np.array([[0.1, 0.05, 2]], np.float32), np.array([[0.1, 0.05, 100]], np.float32)
+    long, short = (np.array([[0, 0, -length]], np.float32) for length in (2e38, 2e-38))
+    assert tracer.closest_hit(near, long).t[0] == np.finfo(np.float32).tiny
+    assert tracer.closest_hit(far, short).t[0] == np.finfo(np.float32).max
+    assert tracer.all_hits(near, long, k=2).t[0, 0] == np.finfo(np.float32).tiny
+    many = np.tile(near, (64, 1)), np.tile(long, (64, 1))
     assert (tracer.closest_hit(*many).t == np.finfo(np.float32).tiny).all()
 
 
