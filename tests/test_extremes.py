@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from striptools.trace.hit import Hits
 from striptools_cli import app
 
 EXPANDED = MODES[0]
+LARGEST, LEAST_NORMAL = extremes.LARGEST, extremes.LEAST_NORMAL
 OTHER_HIERARCHIES = tuple(
     Mode(name, Options(hierarchy=HierarchyOptions(name)), {})
     for name in ("slbvh", "kdtree", "presorted", "loose-octree")
@@ -113,8 +115,8 @@ FAULTS: dict[str, Callable[[Hits], Hits]] = {
     "half a miss": lambda hits: changed(hits, a_hit(hits), face=-1),
     "a wrong miss": one_missed,
     "another face": lambda hits: changed(hits, a_hit(hits), face=(hits.face[a_hit(hits)] + 5) % 150),
-    "the end of the range": lambda hits: changed(hits, a_hit(hits), t=np.finfo(np.float32).max),
-    "the other end": lambda hits: changed(hits, a_hit(hits), t=np.finfo(np.float32).tiny),
+    "the end of the range": lambda hits: changed(hits, a_hit(hits), t=LARGEST),
+    "the other end": lambda hits: changed(hits, a_hit(hits), t=LEAST_NORMAL),
 }
 
 
@@ -208,7 +210,7 @@ def test_a_vertex_that_moved_farther_than_declared_is_a_violation() -> None:
 def test_integers_contradict_a_bound_that_is_too_small(monkeypatch: pytest.MonkeyPatch) -> None:
     honest = judgement.judge_pairs
 
-    def certain(*arguments: object) -> object:
+    def certain(*arguments: Any) -> object:
         pairs = honest(*arguments)
         everywhere = np.ones_like(pairs.clear)
         return replace(pairs, clear=everywhere, side=np.ones_like(pairs.side), ahead=everywhere[:, 0])
@@ -315,9 +317,9 @@ def test_a_hub_is_judged_once_a_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     judged = []
     honest = judgement.judge_fans
 
-    def counting(frames: object, surface: object, fans: object, bound: float) -> object:
-        judged.append(len(fans.face))  # pyright: ignore[reportAttributeAccessIssue]
-        return honest(frames, surface, fans, bound)  # pyright: ignore[reportArgumentType]
+    def counting(frames: Any, surface: Any, fans: Any, bound: float) -> object:
+        judged.append(len(fans.face))
+        return honest(frames, surface, fans, bound)
 
     monkeypatch.setattr(judgement, "judge_fans", counting)
     origin = np.array([[0.1, 0.2, 3]], np.float32)
@@ -340,11 +342,11 @@ def test_t_ends_where_float32_does(asked: dict) -> None:
     tracer = Tracer(convert(ball()), **asked)
     near, far = np.array([[0.1, 0.05, 2]], np.float32), np.array([[0.1, 0.05, 100]], np.float32)
     long, short = (np.array([[0, 0, -length]], np.float32) for length in (2e38, 2e-38))
-    assert tracer.closest_hit(near, long).t[0] == np.finfo(np.float32).tiny
-    assert tracer.closest_hit(far, short).t[0] == np.finfo(np.float32).max
-    assert tracer.all_hits(near, long, k=2).t[0, 0] == np.finfo(np.float32).tiny
+    assert tracer.closest_hit(near, long).t[0] == LEAST_NORMAL
+    assert tracer.closest_hit(far, short).t[0] == LARGEST
+    assert tracer.all_hits(near, long, k=2).t[0, 0] == LEAST_NORMAL
     many = np.tile(near, (64, 1)), np.tile(long, (64, 1))
-    assert (tracer.closest_hit(*many).t == np.finfo(np.float32).tiny).all()
+    assert (tracer.closest_hit(*many).t == LEAST_NORMAL).all()
 
 
 # ---- What XLA does.
