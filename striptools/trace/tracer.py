@@ -47,9 +47,8 @@ class Tracer:
 
     Numbers below 2**-126 count as zero, in origins and in directions. A hit whose t, or whose unit of t (the
     size of the scene over that of the direction), is beyond float32's normal range is told at the end of the
-    range, 2**-126 or the largest number. Origins beyond 2**40 times the
-    largest coordinate of the scene get some finite answer. Everything else is within the bound of
-    `measure.bound`.
+    range, 2**-126 or the largest number. Origins beyond 2**40 times the largest coordinate of the scene get
+    some finite answer. Everything else is within the bound of `measure.bound`.
 
     Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
