@@ -203,7 +203,11 @@ def scale_of(scene: "Scene | Placed") -> np.float32:
     Raises:
         LimitError: All coordinates are denormal.
     """
-    largest = _largest(scene)
+    return scale_for(_largest(scene))
+
+
+def scale_for(largest: float) -> np.float32:
+    """The power of two that brings the largest coordinate to 1 to 2; 1 where it is next to nothing."""
     if largest < float(np.finfo(np.float32).tiny):
         raise LimitError(
             f"the largest coordinate, {largest:.4g}, is less than 2**-126, which counts as zero",
