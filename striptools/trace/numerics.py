@@ -30,7 +30,7 @@ def larger(a: Array, b: Array) -> Array:
 
 def in_range(t: Array) -> Array:
     """A positive t, no less than the least normal float32 and no more than the largest: a hit stays one."""
-    return larger(smaller(t, jnp.float32(HIGHEST)), jnp.float32(LEAST_NORMAL))
+    return larger(smaller(t, HIGHEST), LEAST_NORMAL)
 
 
 def rounded(product: Array) -> Array:

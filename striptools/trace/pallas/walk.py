@@ -26,7 +26,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from striptools.trace.box import Slab
-from striptools.trace.numerics import BY_XLA, Arithmetic
+from striptools.trace.numerics import BY_XLA, Arithmetic, in_range
 from striptools.trace.pallas.arithmetic import BY_TRITON
 from striptools.trace.pallas.tiles import Source, Tile, lane_numbers, source_of
 from striptools.trace.triangle import Shear
@@ -162,7 +162,8 @@ class _Walk:
         """T and name."""
         state = lax.while_loop(lambda s: self.goes_on(s, int(DONE) + 1), self.nodes_then_leaves, self.start())
         name = self.closest_name(state)
-        t = jnp.where(name < 0, np.float32(np.inf), self.arithmetic.product(state.nearest, self.ray.t_unit))
+        t = in_range(self.arithmetic.product(state.nearest, self.ray.t_unit))
+        t = jnp.where(name < 0, np.float32(np.inf), t)
         return [t, jnp.where(state.child != DONE, STUCK, name)]
 
     def start(self) -> _State:
