@@ -130,7 +130,7 @@ def simplify(mesh: Mesh, options: SimplifyOptions, *, threads: int | None = None
     if largest is not None and options.relative:
         largest *= float(np.linalg.norm(whole.bounds[1] - whole.bounds[0]))
     if options.keep is not None:
-        result = _measured(whole, surface, _collapsed(whole, options.keep), None, threads)
+        result = _measured(whole, surface, collapsed(whole, options.keep), None, threads)
         if largest is not None and result.error_bound > largest:
             raise UsageError(
                 f"{result.mesh.triangle_count:,} triangles stray by up to {result.error_bound:.4g}, "
@@ -149,7 +149,7 @@ def _fewest(whole: Mesh, surface: Surface, largest: float, threads: int | None) 
     low, high = math.log(min(1.0, LEAST_TRIANGLES / whole.triangle_count)), 0.0
     for _ in range(SEARCH_STEPS):
         middle = (low + high) / 2
-        tried = _collapsed(whole, math.exp(middle))
+        tried = collapsed(whole, math.exp(middle))
         if tried is not None and _keeps(whole, surface, tried, largest, threads):
             best, high = tried, middle
         else:
@@ -175,8 +175,19 @@ def _measured(
     return Simplified(result, whole.triangle_count, there, deviation(result, surface, limit=largest))
 
 
-def _collapsed(whole: Mesh, keep: float) -> Mesh | None:
-    """The mesh with about that share of its triangles; None where none is left."""
+def collapsed(whole: Mesh, keep: float) -> Mesh | None:
+    """Collapse edges of a clean mesh, and clean again, without measuring what that did.
+
+    Args:
+        whole: Clean and plain.
+        keep: The share of its triangles to keep, above 0.
+
+    Returns:
+        About that share, or the least that can be reached; None where none is left.
+
+    Raises:
+        MissingExtraError: fast-simplification is not installed.
+    """
     if keep >= 1.0:
         return whole
     try:

@@ -29,7 +29,7 @@ MOST_PIECES = 1 << 22
 """Pieces of a round beyond which no more are cut."""
 
 MOST_ROUNDS = 24
-TOLERANCE = 0.01
+TOLERANCE = 0.1
 """How far the upper bound may stay above the lower one, in parts of it."""
 
 ROUNDING = 2.0**-44
@@ -73,7 +73,9 @@ class Surface:
         square, item = np.zeros(len(points)), np.zeros(len(points), np.int32)
         points = np.ascontiguousarray(points, np.float64)
         given = (points, self._corners, self._boxes)
-        in_chunks(lambda part: kernels.closest_triangles(*given, *part, square, item), len(points), self._threads)
+        in_chunks(
+            lambda part: kernels.closest_triangles(*given, *part, square, item), len(points), self._threads
+        )
         return np.sqrt(square), item
 
     def farthest_of(self, pieces: np.ndarray, items: np.ndarray) -> np.ndarray:

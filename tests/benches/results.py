@@ -2,20 +2,15 @@
 
 import csv
 import datetime
-import importlib.metadata
-import os
-import platform
 from dataclasses import dataclass
 from pathlib import Path
+
+from striptools.measure.environment import machine, versions
 
 FILE = Path(__file__).with_name("results.csv")
 COLUMNS = (
     "date", "machine", "versions", "bench", "mesh", "triangles", "metric", "value", "unit",
     "peer", "peer_value", "ratio", "note",
-)  # fmt: skip
-PACKAGES = (
-    "striptools", "numpy", "numba", "trimesh", "jax", "embreex", "meshoptimizer", "vtk", "PyFFI",
-    "DracoPy", "zstandard",
 )  # fmt: skip
 
 
@@ -61,28 +56,6 @@ def append(rows: list[Row]) -> None:
                  row.metric, _short(row.value), row.unit, row.peer, _short(row.peer_value), _short(row.ratio),
                  row.note]
             )  # fmt: skip
-
-
-def machine() -> str:
-    """The processor and how many cores of it this process may use."""
-    model = platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = [line for line in info.read_text().splitlines() if "model name" in line]
-        names = [line.split(":", 1)[1].strip() for line in lines]
-        model = names[0] if names else model
-    return f"{model}, {len(os.sched_getaffinity(0))} cores"
-
-
-def versions() -> str:
-    """Python and the packages whose version may change a figure."""
-    found = [f"python {platform.python_version()}"]
-    for package in PACKAGES:
-        try:
-            found.append(f"{package} {importlib.metadata.version(package)}")
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return "; ".join(found)
 
 
 def _short(value: float | None) -> str:
