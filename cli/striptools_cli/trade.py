@@ -20,7 +20,7 @@ from striptools_cli.streams import STANDARD, Source, folder_for, input_format, s
 from striptools_cli.study import Up
 
 _DEFAULTS = TradeOptions()
-_QUICK = {"side": 128, "runs": 3, "picture": 128, "verify_rays": 16, "aimed_rays": 2048}
+_QUICK = {"side": 256, "runs": 5, "picture": 128, "verify_rays": 16, "aimed_rays": 2048}
 _TEXT = (
     "memory_per_triangle", "disk_per_triangle", "build_seconds", "primary_ratio", "secondary_ratio",
     "largest_error", "declared_bound", "t_rms", "normal_rms", "wrong_per_million", "leaks", "psnr", "flip",
@@ -29,13 +29,15 @@ _TEXT = (
 
 
 def run(
-    mesh: Annotated[str, typer.Argument(metavar="MESH", help="The model; - for standard input.")],
+    meshes: Annotated[
+        list[str], typer.Argument(metavar="MESH...", help="Models; - for standard input.", show_default=False)
+    ],
     out: Annotated[
         str | None,
         typer.Option(
             metavar="DIR",
-            help="Write report.html, plot.png, table.csv and pictures there; go on where an interrupted run of "
-            "the same was.",
+            help="Write report.html, plot.png, tables and pictures there, for several models a folder each; "
+            "go on where an interrupted run of the same was.",
             show_default="no",
         ),
     ] = None,
@@ -87,17 +89,35 @@ def run(
         device=device,
         threads=threads,
     )
+    notice.before_tracing(quiet=quiet)
+    done = []
+    for mesh in meshes:
+        name = "standard-input" if mesh == STANDARD else Path(mesh).stem
+        place = folder if folder is None or len(meshes) == 1 else folder_for(str(folder / name))
+        done.append(_traded(mesh, name, options, place, from_format, quiet))
+        if form != "json":
+            say(printed(done[-1], form))
+    if form == "json":
+        say(
+            printed(done[0], form)
+            if len(done) == 1
+            else render({"trades": [one.to_dict() for one in done]}, form)
+        )
+
+
+def _traded(
+    mesh: str, name: str, options: TradeOptions, folder: Path | None, from_format: str | None, quiet: bool
+) -> Trade:
+    """Measure one model, and write its report."""
     file = Source.open(mesh)
     source = load_mesh(file.file, file_format=input_format(file, from_format) or None)
-    notice.before_tracing(quiet=quiet)
     with StageProgress(quiet=quiet) as progress:
-        name = "standard input" if mesh == STANDARD else Path(file.title).stem
         found = trade(source, options, model=name, folder=folder, watch=progress.watch)
-    say(printed(found, form))
     if folder is not None:
         _write(found, folder)
         if not quiet:
-            say(f"written: {folder / 'report.html'}, plot.png, table.csv\n", error=True)
+            say(f"written: {folder / 'report.html'}, plot.png, table.csv, points.json\n", error=True)
+    return found
 
 
 def printed(found: Trade, form: Format) -> str:
