@@ -151,7 +151,8 @@ def resident_bytes(scene: Scene, resident: Residency) -> int:
         parts = scene.part_bytes()
         return math.ceil(CLASSES * (sum(parts.values()) + 3 * FACE_BYTES * scene.triangle_count))
     packed = scene.with_boxes()
-    assert packed.runs is not None and packed.first_run is not None
+    assert packed.runs is not None
+    assert packed.first_run is not None
     if resident == "expanded":
         per_copy = scene.placed_count / scene.triangle_count
         kept = (
@@ -301,7 +302,7 @@ def _within(
         )
     bits, chosen, scene, report = tried
     kept = resident_bytes(scene, "compressed")
-    why = f"budget {wish.budget:,} bytes: {bits} bits is the finest grid that fits, compressed, at most {kept:,}"
+    why = f"budget {wish.budget:,} bytes: {bits} bits is the finest that fits, compressed, at most {kept:,}"
     return chosen, "compressed", scene, report, why
 
 

@@ -35,8 +35,8 @@ from striptools.threads import every_core
 from striptools.types import Boxes, Counts
 
 STAGES = ("load", "clean", "quantise", "partition", "order", "hierarchy", "output")
-"""The stages of a conversion, in order, and `simplify` after `load` where it is asked; `order` finds the neighbours too, range by range; a command that
-writes the scene adds `write`."""
+"""The stages of a conversion, in order, and `simplify` after `load` where it is asked; `order` finds the
+neighbours too, range by range; a command that writes the scene adds `write`."""
 
 
 @dataclass(frozen=True)

@@ -132,8 +132,8 @@ def run(
         str | None,
         typer.Option(
             metavar="SIZE",
-            help="The most that a tracer may keep, like 100MB: the finest precision that fits, no coarser than "
-            "--max-error.",
+            help="The most that a tracer may keep, like 100MB: the finest precision that fits, no coarser "
+            "than --max-error.",
             show_default="no limit",
         ),
     ] = None,

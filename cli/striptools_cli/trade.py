@@ -127,7 +127,7 @@ def printed(found: Trade, form: Format) -> str:
     if form == "csv":
         return render_table([vars(point) for point in found.points], "csv")
     rows = [_row(point) for point in found.points]
-    heading = f"{found.model}: {found.triangles:,} triangles; lengths in diagonals, rays a second over the default's"
+    heading = f"{found.model}: {found.triangles:,} triangles; lengths in diagonals, rays over the default's"
     lines = sentences(found) + [f"left out: {name}: {why}" for name, why in found.left_out.items()]
     return render_table(rows, form, heading) + "".join(f"\n{line}\n" for line in lines)
 

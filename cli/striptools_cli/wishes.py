@@ -75,8 +75,8 @@ def said_of(simplified: Simplified) -> str:
     after, before = simplified.mesh.triangle_count, simplified.triangles_before
     there, back = (human_value(one.upper) for one in (simplified.of_source, simplified.of_result))
     return (
-        f"  simplified: {after:,} of {before:,} triangles; the source strays at most {there} from the result, "
-        f"the result at most {back} from the source"
+        f"  simplified: {after:,} of {before:,} triangles; the source strays at most {there} from the "
+        f"result, the result at most {back} from the source"
     )
 
 

@@ -32,7 +32,7 @@ LEAST_ERROR = 1e-8
 
 
 def pareto(costs: np.ndarray) -> np.ndarray:
-    """(p,) bool: which rows of (p, k) costs no other row beats: none is at most as dear in all, less in one."""
+    """(p,) bool: which rows of (p, k) costs none beats, being at most as dear in all and less in one."""
     kept = np.ones(len(costs), np.bool_)
     for row, cost in enumerate(costs):
         kept[row] = not ((costs <= cost).all(axis=1) & (costs < cost).any(axis=1)).any()

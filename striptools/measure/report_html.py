@@ -35,9 +35,9 @@ COLUMNS = {
 """The table's columns: fields of a point, and their headings."""
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; color: #222; }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; }
 table { border-collapse: collapse; font-size: 12px; } th, td { padding: 2px 7px; text-align: right; }
-th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child, th:first-child { text-align: left; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child { text-align: left; }
 tr:nth-child(even) { background: #f4f5f7; } .wide { overflow-x: auto; } img { max-width: 100%; }
 figure { display: inline-block; margin: 6px; width: 290px; } figcaption { font-size: 12px; }
 .bad { color: #b00020; font-weight: bold; } footer { color: #666; font-size: 12px; margin-top: 2rem; }
@@ -60,7 +60,7 @@ def report_html(trade: Trade, plot: bytes | None, pictures: dict[str, bytes]) ->
         *(f"<p>{html.escape(line)}</p>" for line in sentences(trade)),
         "" if plot is None else f'<p><img alt="Pareto plots" src="{_inline(plot)}"></p>',
         f'<h2>Every point</h2><div class="wide">{_table(trade)}</div>',
-        "<h2>Pictures</h2><p>Each point by the same camera, and beside it where it differs from the default.</p>",
+        "<h2>Pictures</h2><p>Each point by one camera, and beside it where it differs from the default.</p>",
         *(_figure(point, pictures[point.name]) for point in trade.points if point.name in pictures),
         *(f"<p>Left out: {html.escape(f'{name}: {why}')}</p>" for name, why in trade.left_out.items()),
         f"<footer>{html.escape(trade.machine)}; {html.escape(trade.versions)}</footer></body></html>\n",
@@ -78,26 +78,26 @@ def sentences(trade: Trade) -> list[str]:
         least = min(safe, key=lambda p: p.disk_per_triangle)
         found.append(
             f"Precision buys bytes on disk and costs error, not speed: {least.value} take "
-            f"{least.disk_per_triangle:.2f} bytes per triangle instead of {base.disk_per_triangle:.2f}, move no "
-            f"vertex by more than {least.declared_bound:.1e} diagonals, and send at most ten rays of a million "
-            "to another part of the surface."
+            f"{least.disk_per_triangle:.2f} bytes per triangle instead of {base.disk_per_triangle:.2f}, move "
+            f"no vertex by more than {least.declared_bound:.1e} diagonals, and send at most ten rays of a "
+            "million to another part of the surface."
         )
     packed = of.get("residency: compressed")
     if packed:
         found.append(
             f"Residency buys memory and costs speed, not error: compressed takes "
-            f"{packed.memory_per_triangle:.1f} bytes per triangle instead of {base.memory_per_triangle:.1f}, at "
-            f"{packed.primary_ratio:.2f} of the primary and {packed.secondary_ratio:.2f} of the secondary rays "
-            "a second, with the same hits."
+            f"{packed.memory_per_triangle:.1f} bytes per triangle instead of {base.memory_per_triangle:.1f}, "
+            f"at {packed.primary_ratio:.2f} of the primary and {packed.secondary_ratio:.2f} of the secondary "
+            "rays a second, with the same hits."
         )
     fewer = [point for point in trade.points if point.factor == "simplification"]
     if fewer:
         one = min(fewer, key=lambda p: abs(p.triangles / trade.triangles - 0.25))
         found.append(
             f"Simplification buys everything but error: {one.value} of the triangles take "
-            f"{one.memory_per_triangle:.1f} bytes per source triangle in memory, but the surface strays by up "
-            f"to {one.declared_bound:.1e} diagonals and {one.wrong_per_million:,.0f} rays of a million end on "
-            "another part of it."
+            f"{one.memory_per_triangle:.1f} bytes per source triangle in memory, but the surface strays by "
+            f"up to {one.declared_bound:.1e} diagonals and {one.wrong_per_million:,.0f} rays of a million end "
+            "on another part of it."
         )
     return found
 

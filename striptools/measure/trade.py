@@ -1,7 +1,7 @@
 """What bytes, speed and error are traded for each other, one factor at a time, on any mesh.
 
 Every point is converted, traced and judged by itself, in turn with the default, so that what else the machine
-does falls on both alike, and is written down as soon as it is done: an interrupted trade goes on where it was.
+does falls on both alike, and is written down when it is done: an interrupted trade goes on where it was.
 
 What is measured of a point, in diagonals of the model where it is a length:
 
@@ -380,7 +380,7 @@ class _Bench:
         return render(tracer, scene, self.camera, RenderOptions())
 
     def _truth(self, rays: RaySet) -> dict[str, np.ndarray]:
-        """Of each ray t in float64 (infinite on a miss) and unit normals, by the source's face that is hit."""
+        """Of each ray t in float64, infinite on a miss, and unit normals by the source's face that is hit."""
         hits = self.tracer.closest_hit(rays.origins, rays.directions)
         t, normals = np.full(len(hits.t), np.inf), np.zeros((len(hits.t), 3))
         oracle = Oracle(replace(self.mesh, positions=self.mesh.positions - self.origin), 0.0)

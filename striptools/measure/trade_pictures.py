@@ -35,7 +35,7 @@ def flip(reference: np.ndarray, picture: np.ndarray) -> tuple[float, np.ndarray]
 
 
 def difference_picture(reference: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """(h, 2w, 3) uint8: the picture, and beside it the largest difference of a channel, hot where it is large."""
+    """(h, 2w, 3) uint8: the picture, and beside it the largest difference of a channel, hot if large."""
     away = np.abs(reference.astype(np.int16) - picture.astype(np.int16)).max(axis=2) / 255.0
     place = np.minimum(away / SHOWN, 1.0)
     stops = np.linspace(0, 1, len(COLD_TO_HOT))

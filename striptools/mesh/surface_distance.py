@@ -106,7 +106,7 @@ def deviation(
     slack = ROUNDING * float(np.abs(mesh.bounds).max())
     lower = float(away[mesh.faces].max())
     rms = _root_mean_square(pieces, away[mesh.faces], surface)
-    items, upper = item[mesh.faces], 0.0
+    items, upper, remaining = item[mesh.faces], 0.0, math.inf
     for _ in range(MOST_ROUNDS):
         bound = surface.farthest_of(pieces, items)
         enough = lower * (1 + tolerance) + 4 * slack
