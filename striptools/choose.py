@@ -1,11 +1,8 @@
 """Choose options by what is wanted of the result: a largest error, a budget of memory, a target.
 
 Everything is decided without JAX: errors by the closed-form bounds of grids (reducem/quantize.py), memory by
-counting what a tracer keeps (below), and what targets ask of speed by a table of measured trades: the one
+counting what a tracer keeps (reducem/resident.py), and what targets ask of speed by a table of measured trades: the one
 that is shipped with the package, or the points.json of a `striptools trade` of one's own.
-
-What a tracer keeps, before its size classes add up to `CLASSES`: expanded, 320 bytes a run, 224 a node and 12
-a triangle; compressed, the nodes and runs that rays walk, the blocks as they are, and the remap.
 
 Cost: one conversion, and for a budget that needs a grid up to five more, since the bits are searched by
 halving.
@@ -25,19 +22,15 @@ from striptools.hierarchies.options import HierarchyOptions
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options, Report, convert_with_report
 from striptools.reducem.quantize import LEAST_BITS, MOST_BITS, PrecisionOptions
+from striptools.reducem.resident import Residency, resident_bytes
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 
 Target = Literal["quality", "balanced", "small", "fast"]
 TARGETS: tuple[Target, ...] = get_args(Target)
-Residency = Literal["expanded", "compressed"]
 
 BALANCED_ERROR, SMALL_ERROR = 1e-5, 1e-4
 """The largest errors, in diagonals, of the targets that take a grid where none is given."""
-
-CLASSES = 1 + 1 / 16
-RUN_BYTES, NODE_BYTES, FACE_BYTES = 320, 224, 12
-REMAP_BYTES = 5
 
 TABLE = "choose_table.json"
 BASELINE = "default"
@@ -94,13 +87,13 @@ class Choice:
     Attributes:
         options: Of the conversion.
         resident: How a tracer is to keep the scene.
-        resident_bytes: What it then keeps, at most.
+        resident_bytes: What it then keeps; None where that is not counted.
         why: In one sentence.
     """
 
     options: Options
     resident: Residency
-    resident_bytes: int
+    resident_bytes: int | None
     why: str
 
     def to_dict(self) -> dict[str, Any]:
@@ -143,26 +136,6 @@ def convert_to_wish(
     choice = Choice(options, resident, kept, "; ".join(why))
     scene = replace(scene, metadata={**scene.metadata, "chosen": choice.to_dict()})
     return scene, report, choice
-
-
-def resident_bytes(scene: Scene, resident: Residency) -> int:
-    """What a tracer keeps of a scene at most, in bytes; of instances every one expanded."""
-    if scene.hierarchy is not None or scene.block_count == 0:
-        parts = scene.part_bytes()
-        return math.ceil(CLASSES * (sum(parts.values()) + 3 * FACE_BYTES * scene.triangle_count))
-    packed = scene.with_boxes()
-    assert packed.runs is not None
-    assert packed.first_run is not None
-    if resident == "expanded":
-        per_copy = scene.placed_count / scene.triangle_count
-        kept = (
-            RUN_BYTES * len(packed.runs) + NODE_BYTES * len(packed.nodes) + FACE_BYTES * scene.triangle_count
-        )
-        return math.ceil(CLASSES * per_copy * kept)
-    blocks = scene.blocks
-    kept = packed.nodes.nbytes + packed.runs.nbytes + packed.first_run.nbytes
-    kept += blocks.words.nbytes + blocks.headers.nbytes
-    return math.ceil(CLASSES * (kept + REMAP_BYTES * scene.triangle_count))
 
 
 def shipped_table() -> tuple[Row, ...]:
@@ -281,29 +254,38 @@ def _within(
 ) -> tuple[Options, Residency, Scene, Report, str]:
     """The finest precision that fits a budget, expanded where that fits, and why."""
     assert wish.budget is not None
-    coarsest = options.precision
+    # A target has chosen its precision; without one the finest that fits is wanted.
     finest = options if wish.target is not None else replace(options, precision=PrecisionOptions())
     scene, report = _converted(job, source, finest)
-    plain = options.hierarchy.name == "reducem" and scene.instances is None
-    ways: tuple[Residency, ...] = ("expanded", "compressed") if plain else ("expanded",)
-    for way in ways[ways.index(resident) :] if resident in ways else ways:
-        kept = resident_bytes(scene, way)
+    ways: tuple[Residency, ...] = ("expanded", "compressed") if resident == "expanded" else ("compressed",)
+    for way in ways:
+        kept = _counted(scene, way)
         if kept <= wish.budget:
-            return finest, way, scene, report, f"budget {wish.budget:,} bytes: {way} takes at most {kept:,}"
-    tried = _finest_grid(job, source, options, wish.budget) if plain and wish.target is None else None
+            return finest, way, scene, report, f"budget {wish.budget:,} bytes: {way} takes {kept:,}"
+    tried = _finest_grid(job, source, options, wish.budget) if wish.target is None else None
     if tried is None:
-        kept = min(resident_bytes(scene, way) for way in ways)
+        grid = "8 bits" if options.precision.is_lossless else _bound(options.precision)
         raise UsageError(
-            f"{wish.budget:,} bytes cannot be kept: {ways[-1]} takes {kept:,} before a grid, and no grid "
-            + ("of 8 bits or more" if coarsest.is_lossless else f"within {_bound(coarsest)}")
-            + " is enough",
+            f"{wish.budget:,} bytes cannot be kept: compressed takes {_counted(scene, 'compressed'):,}"
+            + ("" if wish.target is not None else f", and a grid of {grid} still too many"),
             where="--budget",
             remedy="give more, or fewer triangles by --simplify",
         )
     bits, chosen, scene, report = tried
-    kept = resident_bytes(scene, "compressed")
-    why = f"budget {wish.budget:,} bytes: {bits} bits is the finest that fits, compressed, at most {kept:,}"
+    kept = _counted(scene, "compressed")
+    why = f"budget {wish.budget:,} bytes: {bits} bits is the finest that fits, compressed, {kept:,} bytes"
     return chosen, "compressed", scene, report, why
+
+
+def _counted(scene: Scene, resident: Residency) -> int:
+    kept = resident_bytes(scene, resident)
+    if kept is None:
+        raise UsageError(
+            "bytes are counted for the default hierarchy without instances alone",
+            where="--budget",
+            remedy="leave --hierarchy out, and give --no-instances",
+        )
+    return kept
 
 
 def _finest_grid(
@@ -313,7 +295,7 @@ def _finest_grid(
     best, low, high = None, LEAST_BITS, MOST_BITS
     if not options.precision.is_lossless:
         scene, report = _converted(job, source, options)
-        if resident_bytes(scene, "compressed") > budget:
+        if _counted(scene, "compressed") > budget:
             return None
         low = _bits_of(scene) + 1
         best = (low - 1, options, scene, report)
@@ -321,7 +303,7 @@ def _finest_grid(
         bits = (low + high) // 2
         chosen = replace(options, precision=PrecisionOptions(bits))
         scene, report = _converted(job, source, chosen)
-        if resident_bytes(scene, "compressed") <= budget:
+        if _counted(scene, "compressed") <= budget:
             best, low = (bits, chosen, scene, report), bits + 1
         else:
             high = bits - 1
