@@ -1,8 +1,8 @@
 """Choose options by what is wanted of the result: a largest error, a budget of memory, a target.
 
 Everything is decided without JAX: errors by the closed-form bounds of grids (reducem/quantize.py), memory by
-counting what a tracer keeps (reducem/resident.py), and what targets ask of speed by a table of measured trades: the one
-that is shipped with the package, or the points.json of a `striptools trade` of one's own.
+counting what a tracer keeps (reducem/resident.py), and what targets ask of speed by a table of measured
+trades: that of the package, or the points.json of a `striptools trade` of one's own.
 
 Cost: one conversion, and for a budget that needs a grid up to five more, since the bits are searched by
 halving.

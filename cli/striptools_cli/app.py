@@ -26,6 +26,7 @@ VERBS = {
     "render": "Draw a picture of a scene file with the same tracer.",
     "study": "Compare stripifiers or hierarchies on a mesh: memory, rays a second, quality.",
     "trade": "Measure what bytes, speed and error are traded for each other on a mesh.",
+    "bench": "Repeat this project's figures on your models, and say what got worse.",
     "doctor": "Print the environment, for bug reports.",
 }
 """The verbs, with the line that the list of verbs shows."""

@@ -89,7 +89,9 @@ def _scatter(axes: "Axes", points: tuple[Point, ...], places: list[tuple[float, 
         if not chosen:
             continue
         x, y = zip(*(places[k] for k in chosen), strict=True)
-        axes.scatter(x, y, s=26, color=ink, label=factor, zorder=3, marker="*" if factor == BASELINE else "o")
+        base = factor == BASELINE
+        look = {"s": 110 if base else 26, "marker": "*" if base else "o", "zorder": 4 if base else 3}
+        axes.scatter(x, y, color=ink, label=factor, **look)
         if factor in ("precision", "simplification", "residency"):
             for k in chosen:
                 text = points[k].value.removesuffix(" bits")

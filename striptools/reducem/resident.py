@@ -1,7 +1,7 @@
-"""How many bytes a tracer keeps of a scene, counted without tracing: tests hold it equal to the tracer's count.
+"""How many bytes a tracer keeps of a scene, counted without tracing; tests compare with the tracer's count.
 
-Expanded: 320 bytes a run, 224 a node, and 8 a face of the source. Compressed: nodes, runs, blocks and remap as
-they are in a file that stores its boxes, else in size classes.
+Expanded: 320 bytes a run, 224 a node, and 8 a face of the source. Compressed: nodes, runs, blocks and remap
+as they are in a file that stores its boxes, else in size classes.
 """
 
 import math
