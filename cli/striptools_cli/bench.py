@@ -24,7 +24,7 @@ def run(
     models: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[MESH...]", help="Models; a clone's samples without any.", show_default=False
+            metavar="[MESH...]", help="Models; without any a clone's samples.", show_default=False
         ),
     ] = None,
     meshes: Annotated[
@@ -32,7 +32,7 @@ def run(
     ] = None,
     results: Annotated[
         str,
-        typer.Option(metavar="FILE", help="The results file that figures are compared with and added to."),
+        typer.Option(metavar="FILE", help="The file that figures are compared with and added to."),
     ] = "bench.csv",
     quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs.")] = False,
     form: Annotated[Format, typer.Option("--format", help="How to print the figures.")] = "text",
