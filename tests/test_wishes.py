@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import striptools
+from striptools.measure.trade_points import settings
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh, save_mesh
 from striptools.mesh.mesh import Mesh
@@ -23,11 +24,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_budget_is_kept_and_recorded(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert main(["convert", str(model), str(tmp_path / "a.rdm"), "--budget", "80kB"]) == 0
-    assert "chosen: budget 80,000 bytes: " in capsys.readouterr().out
+    assert main(["convert", str(model), str(tmp_path / "a.rdm"), "--budget", "150kB"]) == 0
+    assert "chosen: budget 150,000 bytes: " in capsys.readouterr().out
     scene = striptools.open(tmp_path / "a.rdm")
     assert scene.metadata["chosen"]["resident"] == "compressed"
-    assert scene.metadata["chosen"]["resident_bytes"] <= 80_000
+    assert scene.metadata["chosen"]["resident_bytes"] <= 150_000
 
 
 def test_a_target_says_why(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -73,6 +74,35 @@ def test_wishes_that_cannot_be_kept(
 def test_wishes_are_for_scenes(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["convert", str(model), str(tmp_path / "a.ply"), "--strips", "--target", "small"]) == 2
     assert "OUT is none" in capsys.readouterr().err
+
+
+def test_trade_prints_points_and_writes_a_report(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr("striptools.measure.trade.settings", lambda *a, **k: settings(*a, **k)[:2])
+    arguments = [
+        "trade",
+        str(model),
+        "--quick",
+        "--side",
+        "32",
+        "--runs",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main([*arguments, "--format", "json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [point["factor"] for point in facts["points"]] == ["default", "precision"]
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"report.html", "plot.png", "table.csv", "points.json", "default.png"} <= written
+    # Its points are a table to choose by.
+    table = ["--target", "small", "--table", str(tmp_path / "out" / "points.json")]
+    assert main(["convert", str(model), str(tmp_path / "a.rdm"), *table]) == 0
+    capsys.readouterr()
+    assert main([*arguments, "--format", "csv"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
 
 
 def test_bench_adds_to_its_file(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

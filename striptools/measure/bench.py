@@ -11,8 +11,10 @@ import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -161,16 +163,18 @@ def _rates(name: str, scene: Scene, options: BenchOptions) -> list[Row]:
 def _embree(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
     """What traces the same triangles by embreex; None where it is not installed."""
     try:
-        from embreex import rtcore, rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
+        rtcore: Any = import_module("embreex.rtcore")
+        rtcore_scene: Any = import_module("embreex.rtcore_scene")
+        meshes: Any = import_module("embreex.mesh_construction")
     except ImportError:
         return None
     device = rtcore.EmbreeDevice()
     scene = rtcore_scene.EmbreeScene(device)
-    kept = (device, TriangleMesh(scene, corners))
+    kept = [device, meshes.TriangleMesh(scene, corners)]
 
     def closest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        assert kept
+        # Embree's objects live as long as this function.
+        _ = kept
         far = np.full(len(origins), np.float32(1e37))
         return scene.run(origins, directions, dists=far, query="INTERSECT")
 

@@ -23,6 +23,7 @@ import json
 import math
 import time
 from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -457,7 +458,7 @@ class _Bench:
 def peer_distance(one: Mesh, other: Mesh, samples: int = 100_000) -> float | None:
     """The Hausdorff distance by pymeshlab's samples, both ways; None where pymeshlab is not installed."""
     try:
-        import pymeshlab
+        pymeshlab: Any = import_module("pymeshlab")
     except ImportError:
         return None
     meshes = pymeshlab.MeshSet()

@@ -5,6 +5,8 @@ package flip-evaluator (extra `flip`), imported only here.
 """
 
 import math
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +28,7 @@ def psnr(reference: np.ndarray, picture: np.ndarray) -> float:
 def flip(reference: np.ndarray, picture: np.ndarray) -> tuple[float, np.ndarray] | None:
     """The mean FLIP error and its map, (h, w) of 0 to 1; None where flip-evaluator is not installed."""
     try:
-        from flip_evaluator import evaluate
+        evaluate: Any = import_module("flip_evaluator").evaluate
     except ImportError:
         return None
     given = [np.ascontiguousarray(image, np.float32) / np.float32(255) for image in (reference, picture)]
