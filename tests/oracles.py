@@ -75,3 +75,8 @@ class OracleTracer:
         counted = Counters(nodes, zero, zero, zero, zero, zero) if counters else None
         t, u, v = (column.astype(np.float32) for column in (found.t, found.u, found.v))
         return Hits(t, found.face.copy(), u, v, triangle, counted)
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
+    ) -> np.ndarray:
+        return self.oracle.closest_hit(origins, directions).t < (np.inf if t_max is None else t_max)

@@ -267,6 +267,11 @@ def test_an_existing_output_is_refused_without_force(run, folder: Path, tmp_path
         (("render", "torus.rdm", "x.png", "--view", "1,2"), ["--view", "three numbers"]),
         (("render", "torus.rdm", "x.png", "--view", "0,0,0"), ["view"]),
         (("render", "torus.rdm", "x.png", "--shading", "oil"), ["--shading"]),
+        (("render", "torus.rdm", "x.png", "--ao", "-1"), ["--ao"]),
+        (("render", "torus.rdm"), ["turntable", "OUT.png"]),
+        (("render", "torus.rdm", "--turntable", "3"), ["--out"]),
+        (("render", "torus.rdm", "x.png", "--out", "x"), ["--turntable"]),
+        (("render", "torus.rdm", "-", "--progressive"), ["--progressive", "name a file"]),
         (("dance",), ["dance"]),
         (("--dance",), ["--dance"]),
     ],
@@ -533,7 +538,7 @@ def test_verify_exits_1_on_another_model(run, folder: Path, tmp_path: Path) -> N
     assert "disagreements" in out
 
 
-@pytest.mark.parametrize("shading", ["normal", "depth", "strip", "steps"])
+@pytest.mark.parametrize("shading", ["normal", "depth", "strip", "steps", "light"])
 def test_render_draws_a_picture(run, folder: Path, tmp_path: Path, shading: str) -> None:
     from PIL import Image
 
@@ -544,6 +549,43 @@ def test_render_draws_a_picture(run, folder: Path, tmp_path: Path, shading: str)
     assert pixels.shape == (32, 48, 3)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 3
     assert run("render", folder / "torus.rdm", picture, *size)[0] == 2
+
+
+def test_render_draws_a_turntable(run, folder: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    out = tmp_path / "turn"
+    order = ("render", folder / "torus.rdm", "--turntable", 3, "--out", out, "--shading", "light")
+    order = (*order, "--width", 40, "--height", 24, "--samples", 1, "--ao", 4, "--no-shadow")
+    code, said, _ = run(*order)
+    assert code == 0
+    assert "3 frames" in said
+    names = sorted(file.name for file in out.iterdir())
+    assert names == ["frame_0000.png", "frame_0001.png", "frame_0002.png", "turntable.gif"]
+    frames = [np.asarray(Image.open(out / name)) for name in names[:3]]
+    assert all(frame.shape == (24, 40, 3) for frame in frames)
+    assert (frames[0] != frames[1]).any()
+    with Image.open(out / "turntable.gif") as film:
+        assert film.n_frames == 3
+    assert run(*order)[0] == 2
+    (tmp_path / "file").write_text("")
+    assert run("render", folder / "torus.rdm", "--turntable", 1, "--out", tmp_path / "file")[0] == 3
+
+
+def test_a_picture_on_its_way_is_whole(run, folder: Path, tmp_path: Path, monkeypatch) -> None:
+    from striptools_cli import render as verb
+
+    written = []
+    save = verb.save_png
+    monkeypatch.setattr(verb, "SHOW_SECONDS", 0.0)
+    monkeypatch.setattr(verb, "save_png", lambda picture, place: written.append(1) or save(picture, place))
+    size = ("--width", 300, "--height", 20, "--samples", 1)
+    once, now = tmp_path / "once.png", tmp_path / "now.png"
+    assert run("render", folder / "torus.rdm", once, *size)[0] == 0
+    assert len(written) == 1
+    assert run("render", folder / "torus.rdm", now, *size, "--progressive")[0] == 0
+    assert len(written) == 1 + 3
+    assert once.read_bytes() == now.read_bytes()
 
 
 def test_doctor_tells_the_environment(run) -> None:

@@ -7,13 +7,16 @@ import jax
 import numpy as np
 import pytest
 from scenes import small_scene
+from test_instances import SCENES, load
 
 from striptools.hierarchies.kdtree import build_kdtree
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.hierarchies.slbvh import build_slbvh
 from striptools.kernels.rays import ROW
 from striptools.partition.boxes import range_boxes
+from striptools.pipeline import convert
 from striptools.trace import Tracer
+from striptools.trace.instanced import instances_program
 from striptools.trace.launch import program
 from striptools.trace.walk import WalkOptions
 
@@ -67,6 +70,20 @@ def test_walks_are_hoisted(asked):
     text = compiled_text(**asked)
     assert 'xla_cpu_small_call="true"' in text
     assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
+    assert loops_outside_hoisted_calls(text) == []
+
+
+@pytest.mark.parametrize("resident", ["expanded", "compressed"])
+@pytest.mark.parametrize(("any_hit", "counting"), [(False, False), (True, False), (False, True)])
+def test_the_walk_over_instances_is_hoisted(any_hit, counting, resident):
+    scene = convert(load(SCENES["nested"]))
+    tracer = Tracer(scene, device="cpu", instances="shared", resident=resident)
+    options = tracer._options(any_hit=any_hit, counting=counting)
+    rays = np.zeros((256 * len(tracer.devices), 3), np.float32)
+    lowered = instances_program(tracer._mesh, options).lower(tracer._scene, rays, rays, rays[:, 0])
+    text = lowered.compile().as_text()
+    assert 'xla_cpu_small_call="true"' in text
+    assert len(re.findall(r"= [^\n]* while\(", text)) >= 5
     assert loops_outside_hoisted_calls(text) == []
 
 

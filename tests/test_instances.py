@@ -203,11 +203,6 @@ def test_hits_are_told_by_the_flattened_face():
     assert (tracer.any_hit(origins, target - origins) == ours.hit).all()
 
 
-def test_compressed_tracing_of_instances_is_refused():
-    with pytest.raises(UsageError, match="instances is not traced compressed"):
-        Tracer(convert(load(SCENES["repeated"])), resident="compressed")
-
-
 def test_a_scene_without_instances_has_the_bytes_that_it_had():
     once = glb([ball(), ball(4, 4, 9.0)], [{"mesh": 0, **STRETCH}, {"mesh": 1}], normals=True)
     assert load(once).instances is None

@@ -66,7 +66,7 @@ def run(
         kind = input_format(mesh_file, from_format) or None
         source = load_mesh(mesh_file.file, file_format=kind, instances=loaded.instances is not None)
         notice.before_tracing(quiet=quiet)
-        tracer = Tracer(loaded, device=device, threads=threads)
+        tracer = Tracer(loaded, device=device, threads=threads, instances="flattened")
         report = verify(loaded, source, options, tracer=tracer, watch=progress.watch)
     if not quiet:
         facts = in_lines(report) if form == "text" else describe(report)

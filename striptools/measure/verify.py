@@ -211,7 +211,7 @@ def verify(
     if tracer is None:
         from striptools.trace import Tracer
 
-        tracer = Tracer(scene)
+        tracer = Tracer(scene, instances="flattened")
     judge = Judge(oracle, surface, surface_face, placed)
     tried = min(options.rays, options.pair_budget // (4 * max(1, source.triangle_count)))
     runner = _Runner(judge, tracer, tell, 4 * tried)

@@ -32,7 +32,7 @@ _EXTRA_OPTIONS = re.compile(r"(--xla_backend_extra_options=)(\S*)")
 
 
 class SlowTracingWarning(UserWarning):
-    """JAX was already running when striptools.trace was imported: tracing is right, but slow on a CPU."""
+    """Tracing is right, but slow: JAX was running before striptools.trace came, or a GPU kernel fails."""
 
 
 def with_loop_option(flags: str) -> str:

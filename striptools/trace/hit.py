@@ -22,6 +22,11 @@ class Hits:
         v: (r,) float32, the weight of the third corner. 0 on a miss.
         triangle: (r,) int32, the triangle in the file's order; -1 on a miss.
         counters: (r,) int32 each, what the walk visited, tested and read; None unless asked for.
+        instance: (r,) int32, the instance of the scene; -1 on a miss. None where a scene has no instances:
+            then so are the next two.
+        geometry: (r,) int32, the geometry that stands there; -1 on a miss.
+        geometry_face: (r,) int32, `face` counted within its geometry, the same in all of its instances: face
+            number geometry_face of those that the geometry has in the source. -1 on a miss.
     """
 
     t: Float32[np.ndarray, " r"]
@@ -30,6 +35,9 @@ class Hits:
     v: Float32[np.ndarray, " r"]
     triangle: Int32[np.ndarray, " r"]
     counters: Counters | None = None
+    instance: Int32[np.ndarray, " r"] | None = None
+    geometry: Int32[np.ndarray, " r"] | None = None
+    geometry_face: Int32[np.ndarray, " r"] | None = None
 
     @property
     def hit(self) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Programs for a set of devices, and rays streamed through them in tiles of a few fixed sizes."""
 
+import warnings
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW, ready_rays
-from striptools.trace.device import quiet_jax
+from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import aligned_full
 from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
@@ -28,6 +29,7 @@ PACKET_TILES = (2**3, 2**7, 2**11)
 EVERY_RAY = np.zeros(0, np.int32)
 
 GPU_TILES = (2**12, 2**16, 2**20)
+"""Rays a GPU takes at once: with 2**18, which the kernel does as fast, whole calls are slower by a third."""
 
 IN_FLIGHT = 4
 """Tiles that a GPU works on or waits for while results are taken: bounds memory, whatever the number of
@@ -41,6 +43,9 @@ RAYS = PartitionSpec("device")
 
 EVERYWHERE = PartitionSpec()
 """The whole on each device."""
+
+_refused: set[WalkOptions] = set()
+"""Options with which the kernel could not be compiled in this process."""
 
 
 def device_mesh(devices: list[jax.Device]) -> Mesh:
@@ -60,7 +65,7 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
 
     Rays are (origins, directions, t_max) where all are walked at once, else ready ones or ready packets.
     """
-    walk, arrays = (trace_rays, 3) if options.batch else (_walk_packets if packets else _walk_ready, 1)
+    walk, arrays = _walk_of(options, packets)
     split = jax.shard_map(
         partial(walk, options=options),
         mesh=mesh,
@@ -71,6 +76,16 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     return jax.jit(split)
 
 
+def _walk_of(options: WalkOptions, packets: bool) -> tuple[Any, int]:
+    """What walks rays, and how many arrays they are."""
+    if options.kernel:
+        # Here, so that a JAX without Pallas or its Triton does for all else.
+        from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
+
+        return trace_by_kernel, 3
+    return (trace_rays, 3) if options.batch else (_walk_packets if packets else _walk_ready, 1)
+
+
 def _walk_ready(scene: WalkScene, ready: jax.Array, options: WalkOptions) -> Traced:
     return scene.walk_rays(ready, options)
 
@@ -79,23 +94,44 @@ def _walk_packets(scene: PacketScene, ready: jax.Array, options: WalkOptions) ->
     return scene.walk_packets(ready, options)
 
 
+def _started(mesh: Mesh, options: WalkOptions, scene: WalkScene, *rays: Any) -> Any:
+    """Start a tile; where the kernel cannot be compiled, say so once, and let its twin walk."""
+    if options.kernel and options not in _refused:
+        try:
+            return program(mesh, options)(scene, *rays)
+        except Exception as error:
+            # Pallas, Triton and XLA raise as they please; of what else is wrong the twin will tell.
+            _refused.add(options)
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            warnings.warn(
+                f"the GPU kernel cannot be compiled here; rays are walked many times slower: {reason}",
+                SlowTracingWarning,
+                stacklevel=2,
+            )
+    return program(mesh, options._replace(kernel=False))(scene, *rays)
+
+
 def stream(
     scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
     """Trace any number of rays by devices that prepare them; yield slices of them and results, in order."""
-    yield from stream_through(program(mesh, options), scene, rays, mesh, GPU_TILES)
+    yield from stream_through(partial(_started, mesh, options), scene, rays, mesh, GPU_TILES)
 
 
 def stream_through(
-    compiled: Any, scene: WalkScene, rays: tuple[np.ndarray, ...], mesh: Mesh, sizes: tuple[int, ...]
+    start: Callable[..., Any],
+    scene: WalkScene,
+    rays: tuple[np.ndarray, ...],
+    mesh: Mesh,
+    sizes: tuple[int, ...],
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-    """The same by any program of a scene and arrays; places left over hold zeros."""
+    """The same by whatever starts a scene and arrays; places left over hold zeros."""
     split = NamedSharding(mesh, RAYS)
     waiting: deque[tuple[slice, int, Any]] = deque()
     for part, per_device in tiles(len(rays[0]), mesh.size, sizes):
         with quiet_jax():
             padded = [_spread(a[part], mesh.size, per_device) for a in rays]
-            waiting.append((part, per_device, compiled(scene, *jax.device_put(padded, split))))
+            waiting.append((part, per_device, start(scene, *jax.device_put(padded, split))))
         if len(waiting) >= IN_FLIGHT:
             yield _collect(*waiting.popleft(), mesh.size)
     while waiting:

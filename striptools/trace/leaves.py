@@ -199,7 +199,11 @@ def scale_of(scene: "Scene | Placed") -> np.float32:
 
     Scaling by it is exact, and the model's unit no longer matters.
     """
-    largest = _largest(scene)
+    return scale_for(_largest(scene))
+
+
+def scale_for(largest: float) -> np.float32:
+    """The power of two that brings the largest coordinate to 1 to 2; 1 where it is next to nothing."""
     if largest < float(np.finfo(np.float32).tiny):
         return np.float32(1)
     exponent = int(np.floor(np.log2(largest)))

@@ -5,6 +5,7 @@ denormals, and has slow minimum and maximum operations. The functions here say w
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,36 @@ def _divided_in_double(a: Array, b: Array) -> Array:
     with jax.enable_x64(True):
         exact = a.astype(jnp.float64) / b.astype(jnp.float64)
         return lax.reduce_precision(exact, exponent_bits=11, mantissa_bits=50).astype(jnp.float32)
+
+
+class Arithmetic(NamedTuple):
+    """Operations that each compiler has its own way with, said so that all mean the same.
+
+    Attributes:
+        product: Of two, rounded as by `rounded`.
+        quotient: Of two, rounded correctly.
+        smaller: Of two that compare.
+        larger: Of two that compare.
+        settled: A value that is not computed again for each use.
+        ones: How many bits of a uint32 are set.
+    """
+
+    product: Callable[[Array, Array], Array]
+    quotient: Callable[[Array, Array], Array]
+    smaller: Callable[[Array, Array], Array]
+    larger: Callable[[Array, Array], Array]
+    settled: Callable[[Array], Array]
+    ones: Callable[[Array], Array]
+
+
+BY_XLA = Arithmetic(
+    lambda a, b: rounded(a * b),
+    quotient,
+    smaller,
+    larger,
+    lax.optimization_barrier,
+    lax.population_count,
+)
 
 
 def with_sign_of(a: Array, sign_bit: Array) -> Array:

@@ -10,7 +10,7 @@ from striptools.errors import LimitError
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
 from striptools.trace.counters import Counters
-from striptools.trace.layout import Found, PacketView, Rays
+from striptools.trace.layout import Found, PacketView, Rays, packet_view
 from striptools.trace.leaves import aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
 from striptools.trace.walk_packed import MARGIN, PackedScene
@@ -45,6 +45,12 @@ class PackedLayout:
     depth: int
 
     @property
+    def triangles(self) -> int:
+        """How many there are."""
+        last = self.arrays.headers[self.blocks - 1]
+        return int(last[0]) + int(last[2] & 0xFF) + 1
+
+    @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
         """(6, 8) float32 boxes of the root's children in cells, NaN where there is none, and children."""
         word, record = self.arrays.nodes[0].astype(np.int64), self.arrays.planes[0]
@@ -64,8 +70,12 @@ class PackedLayout:
 
     @property
     def seen_by_packets(self) -> PacketView | None:
-        """Packets are not walked here."""
-        return None
+        """What packets are readied by."""
+        boxes, _ = self.root
+        low, high = np.nanmin(boxes[:3], axis=1), np.nanmax(boxes[3:6], axis=1)
+        frame = self.arrays.frame
+        box = np.concatenate([low * frame.unit + frame.low, high * frame.unit + frame.low])
+        return packet_view(frame, box.astype(np.float32), self.triangles)
 
     @property
     def missed(self) -> Counters:

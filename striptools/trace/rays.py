@@ -13,6 +13,9 @@ from striptools.errors import UsageError
 from striptools.types import RayVectors
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+BANDS = 64
+"""Bands of height, and parts of a turn, that a turntable is framed by."""
+
 CENTRING_STEPS = 12
 UP_CHOICES = ("x", "y", "z", "-x", "-y", "-z")
 THREE_QUARTER = (0.55, 0.38, 1.0)
@@ -83,6 +86,79 @@ class Camera:
         return cls(eye, right, top, forward, tangent, int(width), int(height))
 
 
+def turntable(
+    points: np.ndarray,
+    frames: int,
+    *,
+    width: int = 800,
+    height: int = 600,
+    fov: float = 35.0,
+    view: tuple[float, float, float] = THREE_QUARTER,
+    up: str = "y",
+) -> list[Camera]:
+    """Cameras round a model that turns once: all at one distance, at which it is held whole from all sides.
+
+    The first is at `view`; from one to the next the model turns to its left, the eye to its right.
+
+    Args:
+        points: (k, 3), as of `Camera.framing`, and so is what follows.
+        frames: How many, 1 or more.
+        width: Pixels across.
+        height: Pixels down.
+        fov: Angle of view across the shorter side, in degrees.
+        view: Where the first eye is.
+        up: The axis that the model turns round, as it points to the picture's top.
+
+    Raises:
+        UsageError: As of `Camera.framing`, or there are no frames.
+    """
+    if frames < 1:
+        raise UsageError(f"{frames} frames of a turntable", remedy="at least 1 is wanted")
+    _turned_axes(view, up)
+    axis = np.array(AXES[up[-1]]) * (-1.0 if up.startswith("-") else 1.0)
+    middle, rings = _swept(np.asarray(points, np.float64).reshape(-1, 3), axis)
+    first = Camera.framing(rings, width=width, height=height, fov=fov, view=view, up=up)
+    cameras = []
+    for angle in 2 * np.pi * np.arange(frames) / frames:
+        turn = _turn_about(axis, angle)
+        axes = (turn @ first.right, turn @ first.up, turn @ first.forward)
+        eye = middle + turn @ (first.eye - middle)
+        cameras.append(Camera(eye, *axes, first.tangent, first.width, first.height))
+    return cameras
+
+
+def _swept(points: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The middle of points, and rings about the axis through it that hold all places they turn through."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        points = np.zeros((1, 3))
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    height = (points - middle) @ axis
+    radius = np.linalg.norm(points - middle - height[:, None] * axis, axis=1)
+    low, high = float(height.min()), float(height.max())
+    band = np.minimum((height - low) / max(high - low, 1e-300) * BANDS, BANDS - 1).astype(np.intp)
+    widest = np.zeros(BANDS)
+    np.maximum.at(widest, band, radius)
+    edges = low + (high - low) * np.arange(BANDS + 1) / BANDS
+    # The corners of a polygon that a circle fits in.
+    corner = widest / np.cos(np.pi / BANDS)
+    around = _turn_about(axis, 0.0)[:, np.argsort(np.abs(axis), kind="stable")[:2]].T
+    angles = 2 * np.pi * np.arange(BANDS) / BANDS
+    circle = np.cos(angles)[:, None] * around[0] + np.sin(angles)[:, None] * around[1]
+    rings = [
+        middle + h * axis + corner[:, None, None] * circle
+        for h in (edges[:-1, None, None], edges[1:, None, None])
+    ]
+    return middle, np.concatenate(rings).reshape(-1, 3)
+
+
+def _turn_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """(3, 3), the turn about a unit axis: Rodrigues."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
 def _turned_axes(view: tuple[float, float, float], up: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Right, up and forward of a camera that looks from `view` at the middle, in the model's axes."""
     if up not in UP_CHOICES:
@@ -136,15 +212,56 @@ def _centred(side: np.ndarray, ahead: np.ndarray) -> float:
     return eye
 
 
-def camera_rays(camera: Camera, samples: int = 1) -> tuple[RayVectors, RayVectors]:
+@dataclass(frozen=True)
+class Tile:
+    """A part of a picture: pixels across from `left` to below `right`, down from `top` to below `bottom`."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.bottom - self.top, self.right - self.left
+
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """The rows and columns of a picture that these are."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+def whole_picture(camera: Camera) -> Tile:
+    """All of it."""
+    return Tile(0, 0, camera.width, camera.height)
+
+
+def picture_tiles(camera: Camera, side: int) -> list[Tile]:
+    """A picture cut into squares of so many pixels a side, from the middle outwards."""
+    tiles = [
+        Tile(left, top, min(left + side, camera.width), min(top + side, camera.height))
+        for top in range(0, camera.height, side)
+        for left in range(0, camera.width, side)
+    ]
+
+    def off_centre(tile: Tile) -> int:
+        across, down = tile.left + tile.right - camera.width, tile.top + tile.bottom - camera.height
+        return across**2 + down**2
+
+    return sorted(tiles, key=off_centre)
+
+
+def camera_rays(camera: Camera, samples: int = 1, tile: Tile | None = None) -> tuple[RayVectors, RayVectors]:
     """Rays of a camera, of unit length, in pixel order: row by row from the top left.
 
     Args:
         camera: The camera.
         samples: n for n x n rays a pixel, one in the middle of each part; a pixel's rays follow each other.
+        tile: The part of the picture to make rays for; None for all of it.
 
     Returns:
-        Origins and directions, (height * width * samples^2, 3) float32.
+        Origins and directions, (rows * columns * samples^2, 3) float32.
 
     Raises:
         UsageError: `samples` is less than 1.
@@ -153,8 +270,10 @@ def camera_rays(camera: Camera, samples: int = 1) -> tuple[RayVectors, RayVector
         raise UsageError(f"{samples} samples a pixel", remedy="at least 1 is wanted")
     part = (np.arange(samples) + 0.5) / samples
     shorter = min(camera.width, camera.height)
-    x = (2 * (np.arange(camera.width)[:, None] + part) - camera.width) / shorter * camera.tangent
-    y = (camera.height - 2 * (np.arange(camera.height)[:, None] + part)) / shorter * camera.tangent
+    tile = tile or whole_picture(camera)
+    columns, rows = np.arange(tile.left, tile.right), np.arange(tile.top, tile.bottom)
+    x = (2 * (columns[:, None] + part) - camera.width) / shorter * camera.tangent
+    y = (camera.height - 2 * (rows[:, None] + part)) / shorter * camera.tangent
     across = x[None, :, None, :, None] * camera.right
     upward = y[:, None, :, None, None] * camera.up
     directions = (camera.forward + across + upward).reshape(-1, 3)
@@ -170,6 +289,7 @@ def cosine_rays(
     count: int = 1,
     seed: int = 0,
     offset: float | np.ndarray = 0.0,
+    uniform: np.ndarray | None = None,
 ) -> tuple[RayVectors, RayVectors]:
     """Secondary rays of unit length, distributed by the cosine about the normals, as in ambient occlusion.
 
@@ -184,6 +304,7 @@ def cosine_rays(
         seed: Of the random numbers.
         offset: By how much an origin is lifted off the surface along the normal, in the model's unit; one
             number or one a point.
+        uniform: (k * count, 2), points of the unit square to make directions of; None for random ones.
 
     Returns:
         Origins and directions, (k * count, 3) float32.
@@ -191,7 +312,8 @@ def cosine_rays(
     points = np.repeat(np.asarray(points, np.float64), count, axis=0)
     normals = np.repeat(np.asarray(normals, np.float64), count, axis=0)
     lift = np.repeat(np.broadcast_to(np.asarray(offset, np.float64), len(points) // max(count, 1)), count)
-    uniform = np.random.default_rng(seed).random((len(points), 2))
+    if uniform is None:
+        uniform = np.random.default_rng(seed).random((len(points), 2))
     radius, angle = np.sqrt(uniform[:, 0]), 2 * np.pi * uniform[:, 1]
     height = np.sqrt(np.maximum(0.0, 1 - uniform[:, 0]))
     tangent, bitangent = _tangent_frame(normals)

@@ -1,6 +1,7 @@
 """The tracer: rays in, closest hits or any hits out."""
 
 import math
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -9,15 +10,17 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.threads import in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
 from striptools.trace.counters import KINDS, counters_of
-from striptools.trace.device import DeviceKind, quiet_jax, trace_devices
+from striptools.trace.device import DeviceKind, core_count, quiet_jax, trace_devices
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
+from striptools.trace.instanced import InstancedLayout, InstanceNumbers, lay_out_instanced
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
-from striptools.trace.layout import Layout, Rays
+from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
 
 HierarchyKind = Literal["stored", "rebuilt"]
 ResidentKind = Literal["auto", "expanded", "compressed"]
+InstancesKind = Literal["auto", "flattened", "shared"]
 
 RAYS_SIDE_BY_SIDE = 2
 """Rays that a CPU walks at once; more gain nothing, since their constants no longer fit the registers."""
@@ -49,16 +53,19 @@ class Tracer:
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
 
-    Instances are traced where they stand, every one expanded: a scene with instances takes the memory of its
-    flattened triangles, and `hierarchy` is then always rebuilt. A hit's face is that of the flattened source
-    (`Mesh.flattened` of the mesh that was converted), its triangle one of `scene.placed()`.
+    In a scene with instances a hit's face is that of the flattened source (`Mesh.flattened` of the mesh that
+    was converted), its triangle one of `scene.placed()`; instance, geometry and the face within it are told
+    beside. "shared" keeps each geometry once and moves rays into its frame: inside each instance as
+    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). Where
+    geometries are expanded, `hierarchy` is always rebuilt.
 
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
 
     Args:
         scene: What to trace.
-        device: "auto" takes a GPU where JAX has one.
+        device: "auto" takes a GPU where JAX has one. A kernel walks the rays there; where it cannot be
+            compiled, a `SlowTracingWarning` says why, and its plain-JAX twin walks them, with the same hits.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
             triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
@@ -70,11 +77,14 @@ class Tracer:
             the same. "auto" expands what fits in `memory_budget`.
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
+        instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
+            geometry once, for closest hits and any hits. "auto" flattens what fits in `memory_budget`, and
+            shares where it does not or where `resident` is compressed.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or not both of them together, or the
-            scene has instances, which are not traced compressed yet.
-        LimitError: All instances have more triangles than a mesh may have.
+        UsageError: There is no such device, hierarchy or residency, or not both of them together; or
+            instances are to be shared of which one is too distorted for float32.
+        LimitError: All instances have more triangles than a mesh may have, or, shared, than int32 can number.
     """
 
     def __init__(
@@ -86,20 +96,23 @@ class Tracer:
         hierarchy: HierarchyKind = "stored",
         resident: ResidentKind = "auto",
         memory_budget: int | None = None,
+        instances: InstancesKind = "auto",
     ) -> None:
-        _check_kinds(hierarchy, resident)
+        _check_kinds(hierarchy, resident, instances)
         devices = self._choose(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
-        if scene.instances is not None:
-            resident, hierarchy = _of_instances(resident), "rebuilt"
+        budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
+        self._shared = _shares(scene, instances, resident, budget)
+        if scene.instances is not None and not self._shared:
+            resident, hierarchy = _of_flattened(resident), "rebuilt"
         if scene.hierarchy is not None:
             resident = _of_alternative(resident)
         if resident == "auto":
-            budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
             fits = hierarchy == "rebuilt" or EXPANDED_BYTES * scene.triangle_count <= budget
             resident = "expanded" if fits else "compressed"
         self._resident: ResidentKind = resident
         self._empty = scene.triangle_count == 0
+        self._numbers = None if scene.instances is None else InstanceNumbers.of(scene)
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
 
@@ -112,19 +125,23 @@ class Tracer:
         tracer._choose(device, threads)
         tracer._origin = np.zeros(3)
         tracer._resident, tracer._empty = "expanded", False
+        tracer._shared, tracer._numbers = False, None
         tracer._take(layout)
         return tracer
 
     def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
         """Take the devices to trace on."""
         devices = trace_devices(device, threads)
-        self._on_gpu = devices[0].platform != "cpu"
+        self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
+        self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
         return devices
 
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
         if scene.hierarchy is not None and hierarchy == "stored":
             return lay_out_alternative(scene, scene.hierarchy, threads)
+        if self._shared:
+            return lay_out_instanced(scene, threads, compressed=self._resident == "compressed")
         if self._resident == "compressed":
             return lay_out_packed(scene, threads)
         if hierarchy == "stored":
@@ -154,6 +171,11 @@ class Tracer:
     def resident(self) -> ResidentKind:
         """How the scene is kept: "expanded" or "compressed"."""
         return self._resident
+
+    @property
+    def instances(self) -> InstancesKind | None:
+        """How instances are kept: "flattened" or "shared"; None where the scene has none."""
+        return None if self._numbers is None else "shared" if self._shared else "flattened"
 
     @property
     def resident_bytes(self) -> int:
@@ -196,16 +218,31 @@ class Tracer:
                 counted[at] = traced[2]
             check_ended(traced[1])
             # On this side, while the devices are at the next rays.
-            self._layout.weigh(rays, at, traced, found)
+            self._weigh(rays, at, traced, found)
         if counters:
             counted[dropped == 1] = self._layout.missed if not self._empty else 0
-        return Hits(t, face, u, v, triangle, counters_of(counted) if counters else None)
+        counted = counters_of(counted) if counters else None
+        return Hits(t, face, u, v, triangle, counted, *_instances_of(self._numbers, face, triangle))
+
+    def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
+
+        def weigh(part: tuple[int, int]) -> None:
+            mine = slice(*part)
+            self._layout.weigh(rays, at[mine], tuple(a[mine] for a in traced[:2]), found)
+
+        in_chunks(weigh, len(at), self._weighers)
 
     def _stream(
         self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
         if options is None:
+            return
+        layout = self._layout
+        if isinstance(layout, InstancedLayout):
+            for part, traced in layout.stream(self._scene, rays, self._mesh, options):
+                yield np.arange(part.start, part.stop, dtype=np.int32), traced
             return
         if not options.batch:
             given = (self._scene, self._layout, rays, dropped, self._mesh, options)
@@ -329,6 +366,8 @@ class Tracer:
         checked = checked_points(points)
         if self._empty:
             return np.zeros(len(checked), np.float32)
+        if self._shared:
+            self._need_wide_nodes()
         if self._resident == "compressed":
             raise UsageError(
                 "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
@@ -344,11 +383,19 @@ class Tracer:
         options = self._options()
         if options is None:
             raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
+        if self._shared:
+            self._need_wide_nodes()
         with quiet_jax():
             return jax.device_put(self._layout.arrays, self.devices[0]), options
 
     def _need_wide_nodes(self) -> None:
         """Refuse what only the walk of wide nodes can do."""
+        if self._shared:
+            raise UsageError(
+                "only closest hits and any hits go through shared instances",
+                where="instances",
+                remedy="use instances flattened",
+            )
         if not isinstance(self._layout.arrays, WideScene | PackedScene):
             raise UsageError(
                 "only closest hits and any hits go through this hierarchy",
@@ -377,11 +424,15 @@ class Tracer:
             self._need_wide_nodes()
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        given = (self._stack_size, self._on_gpu, decode, gather, most)
+        plain = not counting and gather is None
+        kernel = self._kernel and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
+        given = (self._stack_size, self._on_gpu, decode, gather, most, kernel)
         return WalkOptions(side_by_side, any_hit, counting, *given)
 
 
-def _check_kinds(hierarchy: str, resident: str) -> None:
+def _check_kinds(hierarchy: str, resident: str, instances: str) -> None:
+    if instances not in ("auto", "flattened", "shared"):
+        raise UsageError(f"no such instances: {instances!r}", remedy="use auto, flattened or shared")
     if hierarchy not in ("stored", "rebuilt"):
         raise UsageError(f"no such hierarchy: {hierarchy!r}", remedy="use stored or rebuilt")
     if resident not in ("auto", "expanded", "compressed"):
@@ -403,15 +454,32 @@ def _of_alternative(resident: ResidentKind) -> ResidentKind:
     return "expanded"
 
 
-def _of_instances(resident: ResidentKind) -> ResidentKind:
-    """How a scene with instances is kept."""
+def _shares(scene: "Scene", instances: InstancesKind, resident: ResidentKind, budget: int) -> bool:
+    """Whether each geometry is kept once."""
+    if scene.instances is None or instances == "flattened":
+        return False
+    fits = EXPANDED_BYTES * scene.placed_count <= budget
+    return instances == "shared" or resident == "compressed" or not fits
+
+
+def _of_flattened(resident: ResidentKind) -> ResidentKind:
+    """How flattened instances are kept."""
     if resident == "compressed":
-        raise UsageError(
-            "a scene with instances is not traced compressed yet",
-            where="resident",
-            remedy="use expanded, or convert it with its instances flattened",
-        )
+        raise UsageError("flattened instances are expanded", where="resident", remedy="use instances shared")
     return "expanded"
+
+
+def _instances_of(
+    numbers: InstanceNumbers | None, face: np.ndarray, triangle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | tuple[None, None, None]:
+    """Instance, geometry and the face within it of each hit; nothing where a scene has no instances."""
+    if numbers is None:
+        return None, None, None
+    instance = numbers.instance_of(triangle)
+    hit = instance >= 0
+    geometry = np.where(hit, numbers.geometry[instance], np.int32(-1))
+    own = np.where(hit, face - numbers.first_face[instance], -1).astype(np.int32)
+    return instance, geometry, own
 
 
 def checked_rays(

@@ -30,7 +30,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from striptools.trace.numerics import SIGN, larger, quotient, rounded, smaller, with_sign_of
+from striptools.trace.numerics import (
+    BY_XLA,
+    SIGN,
+    Arithmetic,
+    larger,
+    quotient,
+    rounded,
+    smaller,
+    with_sign_of,
+)
 
 Corners = tuple[Array, Array, Array]
 """One coordinate of the three corners a, b, c of a triangle, or (8,) each of a leaf's lanes."""
@@ -83,28 +92,30 @@ def pick(vector: Array | tuple[Array, Array, Array], axis: Array) -> Array:
     return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
 
-def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear) -> Edges:
+def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Edges:
     """Edge functions of one triangle or of a block of them, its coordinates along the axes of the shear."""
+    product = arithmetic.product
     heights = [at - shear.origin[2] for at in z]
-    ax, bx, cx = (at - shear.origin[0] - rounded(shear.x * h) for at, h in zip(x, heights, strict=True))
-    ay, by, cy = (at - shear.origin[1] - rounded(shear.y * h) for at, h in zip(y, heights, strict=True))
-    a, b, c = (rounded(h * shear.z) for h in heights)
+    ax, bx, cx = (at - shear.origin[0] - product(shear.x, h) for at, h in zip(x, heights, strict=True))
+    ay, by, cy = (at - shear.origin[1] - product(shear.y, h) for at, h in zip(y, heights, strict=True))
+    a, b, c = (product(h, shear.z) for h in heights)
     return Edges(
-        rounded(cx * by) - rounded(cy * bx),
-        rounded(ax * cy) - rounded(ay * cx),
-        rounded(bx * ay) - rounded(by * ax),
+        product(cx, by) - product(cy, bx),
+        product(ax, cy) - product(ay, cx),
+        product(bx, ay) - product(by, ax),
         (a, b, c),
-        _straddle(ax, bx, cx) & _straddle(ay, by, cy),
+        _straddle(ax, bx, cx, arithmetic) & _straddle(ay, by, cy, arithmetic),
         (ay, by, cy),
     )
 
 
-def _straddle(a: Array, b: Array, c: Array) -> Array:
+def _straddle(a: Array, b: Array, c: Array, arithmetic: Arithmetic) -> Array:
     """Whether three coordinates lie on both sides of zero, or on it."""
+    smaller, larger = arithmetic.smaller, arithmetic.larger
     return (smaller(smaller(a, b), c) <= 0) & (larger(larger(a, b), c) >= 0)
 
 
-def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
+def crossing_of(edges: Edges, turn: Array | None = None, arithmetic: Arithmetic = BY_XLA) -> Array:
     """Where along a ray its line goes through each triangle: positive and finite only where it does.
 
     The division comes last on purpose: XLA computes a division once, all that is cheap again for each use.
@@ -112,14 +123,16 @@ def crossing_of(edges: Edges, turn: Array | None = None) -> Array:
     Args:
         edges: Of the triangles.
         turn: Which corner is the first in the canonical order; None where that is corner a.
+        arithmetic: Of the compiler at hand.
     """
     a, b, c, heights, around, _ = edges
+    product = arithmetic.product
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     determinant = _summed(a, b, c, turn)
-    scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
+    scaled_t = _summed(product(a, heights[0]), product(b, heights[1]), product(c, heights[2]), turn)
     sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
-    return lax.optimization_barrier(quotient(scaled_t, with_sign_of(determinant, sign)))
+    return arithmetic.settled(arithmetic.quotient(scaled_t, with_sign_of(determinant, sign)))
 
 
 def windings_of(edges: Edges, shear: Shear) -> Array:

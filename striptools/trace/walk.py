@@ -34,13 +34,25 @@ from jaxtyping import Int32
 
 from striptools.trace.box import Slab, slab_of
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import folded, index, larger, power_of_two_below, quotient, smaller
+from striptools.trace.numerics import (
+    BY_XLA,
+    Arithmetic,
+    folded,
+    index,
+    larger,
+    power_of_two_below,
+    quotient,
+    smaller,
+)
 from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, shear_of
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 
 WIDTH = 8
 FLOATS = 17
 """Float32 words at the head of a ready ray; int32 words follow."""
+
+START = 4
+"""Where among the int32 words a ray's first child is."""
 
 DONE = np.int32(-(2**31))
 """The next child of a ray that has nothing left to visit."""
@@ -103,10 +115,10 @@ class Leaf(NamedTuple):
     filled: Array | None
     name: Array
 
-    def crossings(self, shear: Shear) -> Array:
+    def crossings(self, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Array:
         """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
-        t = crossing_of(edges_of(self.x, self.y, self.z, shear), self.turn)
-        return t if self.filled is None else jnp.where(self.filled, t, jnp.float32(0))
+        t = crossing_of(edges_of(self.x, self.y, self.z, shear, arithmetic), self.turn, arithmetic)
+        return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
 
 
 class WalkScene(Protocol):
@@ -179,6 +191,7 @@ class WalkOptions(NamedTuple):
         decode: How leaves are decoded, where they are packed.
         gather: What to gather in the place of the closest hit, if anything.
         most: How many hits to gather, where all are.
+        kernel: Walk by the kernel of `trace.pallas`, whose twin `batch` is; nothing is counted or gathered.
     """
 
     interleave: int
@@ -189,6 +202,7 @@ class WalkOptions(NamedTuple):
     decode: "Decode | None" = None
     gather: GatherKind | None = None
     most: int = 0
+    kernel: bool = False
 
 
 class Decode(NamedTuple):
@@ -269,7 +283,7 @@ class ReadyRay(NamedTuple):
     @property
     def start(self) -> "Place":
         """Where the walk starts."""
-        return Place(self.ints[4] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1), jnp.uint32(0))
+        return Place(self.ints[START] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1), jnp.uint32(0))
 
     @property
     def visited(self) -> Array:
@@ -329,11 +343,7 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
         options: What to compile in.
     """
     rows = ready.reshape(len(ready) // options.interleave, options.interleave, -1)
-    end = scene.node_count - 1
-
-    # The bottom of a stack has a lane that no node has.
-    floor = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(jnp.array([end, 256], jnp.int32))
-    stacks = (floor,) * options.interleave
+    stacks = (_floor(scene, options),) * options.interleave
 
     def walk(stacks: tuple[Array, ...], group: Array) -> tuple[tuple[Array, ...], _Walked]:
         return _walk_group(scene, group, stacks, options)
@@ -349,6 +359,20 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     return Traced(t, name, counters, counted.reshape(-1))
 
 
+def _floor(scene: Any, options: WalkOptions) -> Array:
+    """An empty stack: its bottom has a lane that no node has."""
+    bottom = jnp.array([scene.node_count - 1, 256], jnp.int32)
+    return jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
+
+
+def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root: Array) -> Array:
+    """One ready ray that starts at any node: (24,) float32."""
+    floats, ints = _prepare(scene, origin, direction, t_max)
+    start = (jnp.arange(len(ints)) == START) & (ints != 0)
+    ints = jnp.where(start, ints ^ root, ints)
+    return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)])
+
+
 def ready_ray(row: Array) -> ReadyRay:
     """The ray that a row says."""
     ints = lax.bitcast_convert_type(row[FLOATS:], jnp.int32)
@@ -360,14 +384,11 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
 
     A ray is scaled by powers of two: neither the model's unit nor the direction's length matters after that.
     """
-    size = jnp.abs(direction)
-    longest = larger(larger(size[0], size[1]), size[2])
-    shorten, length = power_of_two_below(longest)
     frame = scene.frame
-    origin = origin * frame.scale
-    finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
+    longest = largest_of(direction)
+    shorten, length = power_of_two_below(longest)
+    origin, direction, finite = scaled_ray(frame, origin, direction)
     valid = finite & (longest >= np.finfo(np.float32).tiny) & (t_max > 0)
-    direction = direction * shorten
     mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
     slab = slab_of(origin, direction, frame)
     shear = shear_of(origin, direction)
@@ -384,6 +405,20 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     zero = jnp.int32(0)
     axes = (axis.astype(jnp.int32) for axis in shear.axes)
     return floats, jnp.stack([*axes, mirror, start, zero, zero])
+
+
+def largest_of(vector: Array) -> Array:
+    """The largest of three coordinates, in size."""
+    size = jnp.abs(vector)
+    return larger(larger(size[0], size[1]), size[2])
+
+
+def scaled_ray(frame: Frame, origin: Array, direction: Array) -> tuple[Array, Array, Array]:
+    """A ray scaled by powers of two, the direction's largest component to 1 to 2; whether it is finite."""
+    shorten = power_of_two_below(largest_of(direction))[0]
+    origin = origin * frame.scale
+    finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
+    return origin, direction * shorten, finite
 
 
 def next_child(
@@ -538,13 +573,23 @@ def _walk_group(
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
     rays = tuple(ready_ray(row) for row in group)
-    walk = _Walk(scene, rays, options)
-    zero = jnp.int32(0)
-    places = tuple(ray.start for ray in rays)
-    bests = tuple(_nothing_found(ray, options) for ray in rays)
-    visits = tuple(ray.visited * _A_NODE for ray in rays) if options.counting else ()
+    state, bests = _walked(
+        _Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays)
+    )
+    results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
+    t, name, count = (jnp.stack([r[k] for r in results]) for k in range(3))
+    counters = jnp.zeros((len(rays), 0), jnp.int32)
+    if state.visits:
+        counters = jnp.stack([jnp.stack(scene.counters_of(*each)) for each in state.visits])
+    return state.stacks, _Walked(t, name, counters, count)
 
-    def nodes_then_leaves(carried: tuple[_State, tuple[Found, ...]]) -> tuple[_State, tuple[Found, ...]]:
+
+def _walked(walk: _Walk, stacks: tuple[Array, ...], bests: tuple[Any, ...]) -> tuple[_State, tuple[Any, ...]]:
+    """Walk until no ray has anything left to visit."""
+    places = tuple(ray.start for ray in walk.rays)
+    visits = tuple(ray.visited * _A_NODE for ray in walk.rays) if walk.options.counting else ()
+
+    def nodes_then_leaves(carried: tuple[_State, tuple[Any, ...]]) -> tuple[_State, tuple[Any, ...]]:
         state, bests = carried
         state = lax.while_loop(
             lambda s: walk.goes_on(s, lambda place: place.child >= 0),
@@ -553,17 +598,45 @@ def _walk_group(
         )
         return walk.visit_leaves(state, bests)
 
-    state, bests = lax.while_loop(
+    return lax.while_loop(
         lambda carried: walk.goes_on(carried[0], lambda place: place.child != DONE),
         nodes_then_leaves,
-        (_State(places, stacks, zero, visits), bests),
+        (_State(places, stacks, jnp.int32(0), visits), bests),
     )
-    results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
-    t, name, count = (jnp.stack([r[k] for r in results]) for k in range(3))
-    counters = jnp.zeros((len(rays), 0), jnp.int32)
-    if visits:
-        counters = jnp.stack([jnp.stack(scene.counters_of(*each)) for each in state.visits])
-    return state.stacks, _Walked(t, name, counters, count)
+
+
+class Alone(NamedTuple):
+    """The end of the walk of one ray, from any node on: `ended` within the bound, what was visited, (3,)."""
+
+    ray: ReadyRay
+    ended: Array
+    best: Any
+    visits: Array
+
+
+def walk_alone(
+    scene: Any, row: Array, options: WalkOptions, nothing: Callable[[ReadyRay], Any] | None = None
+) -> Alone:
+    """Walk one ray.
+
+    Args:
+        scene: What to trace: of `WalkScene` what the walk asks.
+        row: (24,) float32, as from `prepared_ray`.
+        options: What to compile in.
+        nothing: What the ray has found before; None for no triangle.
+    """
+    ray = ready_ray(row)
+    best = _nothing_found(ray, options) if nothing is None else nothing(ray)
+    state, bests = _walked(_Walk(scene, (ray,), options), (_floor(scene, options),), (best,))
+    visits = state.visits[0] if state.visits else jnp.zeros(3, jnp.int32)
+    return Alone(ray, state.places[0].child == DONE, bests[0], visits)
+
+
+def found_alone(scene: Any, end: Alone, any_hit: bool) -> tuple[Array, Array]:
+    """What is reported of the walk of one ray: t in the caller's units, and the name of the triangle."""
+    child = jnp.where(end.ended, DONE, 0)
+    place = Place(child, child, child, child, child)
+    return _result(scene, end.ray, place, end.best, any_hit)[:2]
 
 
 def _nothing_found(ray: ReadyRay, options: WalkOptions) -> Found:

@@ -48,6 +48,7 @@ from striptools.trace.walk import (
     replaced,
     walk_rays,
 )
+from striptools.trace.walk_packets import walk_packets
 
 MARGIN = np.float32(2.0**-19)
 """Widening of a box in units of the largest coordinate of ray origin and scene."""
@@ -104,9 +105,8 @@ class PackedScene(NamedTuple):
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         at = index(node)
-        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
-        planes = planes.astype(jnp.int32)
-        head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
+        planes = self._planes_of(at)
+        head = self._row(self.nodes, at, 0, 4)
         origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
         shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
         low, high = [], []
@@ -115,7 +115,7 @@ class PackedScene(NamedTuple):
             near, far = ((origin + (planes[row] << shift)).astype(jnp.float32) for row in (axis, axis + 3))
             low.append(near * slab.inverse[axis] - slab.low[axis])
             high.append(far * slab.inverse[axis] - slab.high[axis])
-        return passes(low, high, limit) & (planes[0] <= planes[3])
+        return self._passes(low, high, limit) & (planes[0] <= planes[3])
 
     def boxes_of(self, node: Array) -> Array:
         """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
@@ -128,14 +128,46 @@ class PackedScene(NamedTuple):
         boxes = _number(cells) * self.frame.unit[:, None] + self.frame.low[:, None]
         return jnp.where(planes[0] <= planes[3], boxes.reshape(6, LANES), jnp.float32(jnp.nan))
 
+    def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
+        """Sides of a node's boxes, scaled and rounded; not a number where there is none."""
+        head = self._head(node)
+        planes = [self._planes(node, row, jnp.uint32(0), LANES) for row in rows]
+        sides = [self._side(head, row, each) for row, each in zip(rows, planes, strict=True)]
+        sides[0] = jnp.where(planes[0] <= planes[1], sides[0], jnp.float32(jnp.nan))
+        return sides
+
+    def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
+        """Sides of the box in one lane."""
+        head = self._head(node)
+        return [self._side(head, row, self._planes(node, row, lane, 1)[0]) for row in rows]
+
+    def _head(self, node: Array) -> Array:
+        return lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
+
+    def _planes(self, node: Array, row: Array, lane: Array, count: int) -> Array:
+        at = (index(node), jnp.uint32(16) + LANES * row + lane)
+        return lax.dynamic_slice(self.planes, at, (1, count))[0].astype(jnp.int32)
+
+    def _side(self, head: Array, row: Array, planes: Array) -> Array:
+        """Where planes in one of the six rows lie, scaled."""
+        axis = jnp.where(row >= 3, row - 3, row)
+        origin = pick((head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF), axis).astype(jnp.int32)
+        shift = pick((head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28), axis).astype(jnp.int32)
+        cells = (origin + (planes << shift)).astype(jnp.float32)
+        return cells * pick(self.frame.unit, axis) + pick(self.frame.low, axis)
+
+    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+        """Walk packets made ready."""
+        return walk_packets(self, ready, options)
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
-        head = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
-        bit = jnp.uint32(1) << (lane & 7)
+        head = self._row(self.nodes, index(node), 0, 4)
+        bit = np.uint32(1) << (lane & 7)
         inner, leaves = head[3] >> 16 & 0xFF, head[1] >> 24
         below = bit - 1
-        as_node = (head[0] & 0xFFFFFFF) + lax.population_count(inner & below)
-        as_block = self.top_count + (head[1] & BLOCK_BITS) + lax.population_count(leaves & below)
+        as_node = (head[0] & 0xFFFFFFF) + self._ones(inner & below)
+        as_block = self.top_count + (head[1] & BLOCK_BITS) + self._ones(leaves & below)
         as_run = ~(index(node) << 3 | (lane & 7))
         child = jnp.where(index(node) < self.top_count, as_block, as_run)
         child = jnp.where((inner & bit) != 0, as_node, child).astype(jnp.int32)
@@ -144,17 +176,35 @@ class PackedScene(NamedTuple):
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a run, decoded, their corners along these axes."""
+        x, y, z, filled, name = self._decoded(child, decode)
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
+
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The same, decoded once: behind a cond, or XLA decodes it anew for every use and for every axis."""
+        shape = jnp.zeros(LANES)
+        nothing = ([shape] * 3,) * 3
+        x, y, z, filled, name = lax.cond(
+            child < 0,
+            lambda: self._decoded(child, decode),
+            lambda: (*nothing, jnp.zeros(LANES, jnp.bool_), jnp.zeros(LANES, jnp.int32)),
+        )
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
+
+    def _decoded(
+        self, child: Array, decode: Decode | None
+    ) -> tuple[list[Array], list[Array], list[Array], Array, Array]:
+        """Coordinates x, y, z of corners a, b, c, which lanes hold a triangle, and their names."""
         assert decode is not None
         # Behind barriers, or XLA finds the run anew for every use of it.
-        block, run = lax.optimization_barrier(self._run_of(child))
-        header = lax.optimization_barrier(lax.dynamic_slice(self.headers, (block, jnp.uint32(0)), (1, 8))[0])
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
+        block, run = self._settled(self._run_of(child))
+        header = self._settled(self._row(self.headers, block, 0, 8))
+        lane = self._lanes()
         corners = self._corners(header, run, decode.flips)
         x, y, z = self._positions(header, corners, decode)
-        turn = _first_corner(x, y, z)
-        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
-        return Leaf(ax, ay, az, turn, lane <= (run >> 8 & 7), name)
+        return x, y, z, lane <= (run >> 8 & 7), name
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""
@@ -191,47 +241,86 @@ class PackedScene(NamedTuple):
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""
         block, place = index(names) >> 8, index(names) & 0xFF
-        triangle = _at(self.headers, (block, jnp.uint32(0))) + place
-        face = _at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
+        triangle = self._at(self.headers, (block, np.uint32(0))) + place
+        face = self._at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
         return jnp.where(names < 0, names, face)
+
+    # What follows says how arrays are read; the walk on a GPU reads them in its own way.
+
+    def _lanes(self) -> Array:
+        """The number of each lane, uint32."""
+        return jnp.arange(LANES, dtype=jnp.uint32)
+
+    def _at(self, values: Array, places: Any) -> Array:
+        """Values at places, or at rows and columns, that are known to be inside."""
+        return values.at[places].get(mode="promise_in_bounds")
+
+    def _row(self, rows: Array, row: Array, first: int, count: int) -> Any:
+        """Some values of a row, one after the other."""
+        return lax.dynamic_slice(rows, (row, jnp.uint32(first)), (1, count))[0]
+
+    def _planes_of(self, node: Array) -> Any:
+        """(6, 8) int32: the lanes' planes on each axis, low and high."""
+        planes = lax.dynamic_slice(self.planes, (node, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        return planes.astype(jnp.int32)
+
+    def _words_at(self, places: Array, count: int) -> list[Array]:
+        """Words at places, at the places behind them, and so on: one gather, cheaper than several."""
+        dimensions = lax.GatherDimensionNumbers(
+            offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,)
+        )
+        inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+        rows = lax.gather(self.words, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
+        return [rows[k] for k in range(count)]
+
+    def _settled(self, values: Any) -> Any:
+        """Values that are not computed again for each use."""
+        return lax.optimization_barrier(values)
+
+    def _ones(self, values: Array) -> Array:
+        """How many bits are set."""
+        return lax.population_count(values)
+
+    def _passes(self, low: list[Array], high: list[Array], limit: Array) -> Array:
+        """As `box.passes`."""
+        return passes(low, high, limit)
 
     def _run_of(self, child: Array) -> tuple[Array, Array]:
         """The block of a leaf, and what is said of its run."""
         code = index(~child)
         node, slot = code >> 3, code & 7
         head, low_x, high_x = (
-            lax.dynamic_slice(self.nodes, (node, jnp.uint32(at)), (1, size))[0]
-            for at, size in ((0, 4), (4, 2), (10, 2))
+            self._row(self.nodes, node, at, size) for at, size in ((0, 4), (4, 2), (10, 2))
         )
-        inner, below = head[3] >> 16 & 0xFF, (jnp.uint32(1) << slot) - 1
+        inner, below = head[3] >> 16 & 0xFF, (np.uint32(1) << slot) - 1
         bits = 8 * (slot & 3)
-        under = (jnp.uint32(1) << bits) - 1
+        under = (np.uint32(1) << bits) - 1
         first = _used_bytes(low_x[0], high_x[0]) & jnp.where(slot < 4, under, ALL)
         second = _used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
-        rank = lax.population_count(first | second >> 1) - lax.population_count(inner & below)
+        rank = self._ones(first | second >> 1) - self._ones(inner & below)
         block = head[1] & BLOCK_BITS
-        return block, _at(self.runs, _at(self.first_run, block) + (head[1] >> 24) + rank)
+        return block, self._at(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
 
     def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
         word, counts = header[1], header[2]
         triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1
-        lane = jnp.arange(LANES, dtype=jnp.uint32)
+        lane = self._lanes()
         first = run & 0xFF
         place = first + 2 * (run >> 11 & 0xFF) + 1
 
         # The far corner is what the last other turn left behind.
         turns = run >> 19 & 0xFF
         turned = (turns >> lane & 1) != 0
-        other = jnp.where(turned, ~turns, turns) & ((jnp.uint32(2) << lane) - 1)
-        last = 31 - lax.clz(other)
+        other = jnp.where(turned, ~turns, turns) & ((np.uint32(2) << lane) - 1)
+        last = 31 - _leading_zeros(other)
 
-        width = 32 - lax.clz(counts >> 8 & 0xFF)
-        mask = (jnp.uint32(1) << width) - 1
+        width = 32 - _leading_zeros(counts >> 8 & 0xFF)
+        mask = (np.uint32(1) << width) - 1
         indices = (2 + has_flips) * triangles
         near = self._windows(word, indices + place * width, width * lane)
         far = self._windows(word, indices + place * width, width * jnp.where(other == 0, 0, last))
-        before = self._windows(word, indices + (place - (run >> 27)) * width, jnp.uint32(0), 2)
+        before = self._windows(word, indices + (place - (run >> 27)) * width, np.uint32(0), 2)
         far = jnp.where(other == 0, before, far) & mask
         if flips:
             flipped = self._windows(word, 2 * triangles + first, lane, 3) & has_flips
@@ -239,10 +328,10 @@ class PackedScene(NamedTuple):
         newest, near = near >> width & mask, near & mask
         return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
 
-    def _windows(self, word: Array, bit: Array, further: Array, count: int = 4) -> Array:
+    def _windows(self, word: Array, bit: Array, further: Any, count: int = 4) -> Array:
         """Uint32: 32 bits of a stream from `bit` plus each of `further` on, all of them in `count` words."""
         at = word + (bit >> 5)
-        loaded = [_at(self.words, at + k) for k in range(count)]
+        loaded = [self._at(self.words, at + k) for k in range(count)]
         bits = (bit & 31) + further
         place, shift = bits >> 5, bits & 31
         lower, upper = loaded[0], loaded[1]
@@ -259,7 +348,7 @@ class PackedScene(NamedTuple):
         """Scaled coordinates x, y, z of the corners, (8,) float32 each."""
         counts = header[2]
         triangles, strips, has_flips = (counts & 0xFF) + 1, (counts >> 16 & 0xFF) + 1, counts >> 24 & 1
-        index_width = 32 - lax.clz(counts >> 8 & 0xFF)
+        index_width = 32 - _leading_zeros(counts >> 8 & 0xFF)
         vertices = (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
         axes = _axes(header, self.scale_exponent)
         stride = axes[0].width + axes[1].width + axes[2].width
@@ -267,7 +356,7 @@ class PackedScene(NamedTuple):
         for corner in corners:
             bit = vertices + corner * stride
             shift = bit & 31
-            loaded = [*_rows_at(self.words, header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
+            loaded = [*self._words_at(header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
             vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
         return [[vertex[axis] for vertex in found] for axis in range(3)]
@@ -276,7 +365,7 @@ class PackedScene(NamedTuple):
 class _Axis(NamedTuple):
     """How a block's coordinates on an axis are written: () each."""
 
-    offset: Array
+    offset: Any
     width: Array
     mode: Array
     anchor: Array
@@ -289,7 +378,7 @@ def _axes(header: Array, scale_exponent: Array) -> list[_Axis]:
     described = header[6], header[6] >> 8, header[6] >> 16
     exponents = header[6] >> 24, header[7] & 0xFF, header[7] >> 8 & 0xFF
     axes = []
-    offset = jnp.uint32(0)
+    offset = np.uint32(0)
     for axis in range(3):
         width, mode = described[axis] & 63, described[axis] >> 6 & 3
         exponent = exponents[axis].astype(jnp.int32) - 149 + scale_exponent
@@ -305,12 +394,12 @@ def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
     lower, upper = padded[0], padded[1]
     for k in range(1, min(3, len(vertex))):
         lower, upper = jnp.where(place == k, padded[k], lower), jnp.where(place == k, padded[k + 1], upper)
-    mask = jnp.where(axis.width == 0, jnp.uint32(0), jnp.uint32(0xFFFFFFFF) >> (32 - axis.width & 31))
+    mask = jnp.where(axis.width == 0, np.uint32(0), ALL >> (32 - axis.width & 31))
     number = (lower >> shift | upper << 1 << (31 - shift)) & mask
     whole = (axis.anchor + number).astype(jnp.int32)
     value = whole.astype(jnp.float32)
     if decode.minus_zero:
-        value = jnp.where((axis.mode == 1) & (number == mask), jnp.float32(0), value)
+        value = jnp.where((axis.mode == 1) & (number == mask), np.float32(0), value)
     if decode.tiny:
         value = _scaled(value, axis.exponent)
         return jnp.where(axis.mode == 2, _from_bits(whole, axis.scale_exponent), value)
@@ -336,7 +425,7 @@ def _scaled(number: Array, exponent: Array) -> Array:
     """A number times a power of two, in two steps since one may be out of range; zero where denormal."""
     first = jnp.clip(exponent, -126, 127)
     value = number * _power_of_two(first) * _power_of_two(jnp.clip(exponent - first, -126, 127))
-    return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, jnp.float32(0), value)
+    return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, np.float32(0), value)
 
 
 def _along(x: list[Array], y: list[Array], z: list[Array], axis: Array) -> Corners:
@@ -358,7 +447,7 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
 
 def _any(flags: Array) -> Array:
     """Whether any lane's flag is set."""
-    return jnp.sum(jnp.where(flags, jnp.int32(1), jnp.int32(0))) != 0
+    return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
 
 
 def _number(a: Array) -> Array:
@@ -366,28 +455,20 @@ def _number(a: Array) -> Array:
     return a.astype(jnp.int32).astype(jnp.float32)
 
 
+def _leading_zeros(a: Array) -> Array:
+    """Of uint32, by way of int32: Triton counts those of no others."""
+    return lax.clz(a.astype(jnp.int32)).astype(jnp.uint32)
+
+
 def _power_of_two(exponent: Array) -> Array:
     """2**exponent, exponent (int32) from -126 to 127."""
     return lax.bitcast_convert_type((exponent + 127) << 23, jnp.float32)
 
 
-def _at(values: Array, places: Any) -> Array:
-    """Values at places that are known to be inside."""
-    return values.at[places].get(mode="promise_in_bounds")
-
-
-def _rows_at(values: Array, places: Array, count: int) -> list[Array]:
-    """Values at places, at the places behind them, and so on: one gather, which is cheaper than several."""
-    dimensions = lax.GatherDimensionNumbers(offset_dims=(0,), collapsed_slice_dims=(), start_index_map=(0,))
-    inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    rows = lax.gather(values, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
-    return [rows[k] for k in range(count)]
-
-
 def _used_bytes(low: Array, high: Array) -> Array:
     """The top bit of each byte but of those where low is 1 and high is 0: four slots that are not empty."""
     other = (low ^ 0x01010101) | high
-    return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & jnp.uint32(0x80808080)
+    return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & np.uint32(0x80808080)
 
 
 # Notes

@@ -30,7 +30,7 @@ from jax import Array, lax
 
 from striptools.kernels.packets import HEAD, PACKET
 from striptools.trace.numerics import folded, index, larger, smaller
-from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of
+from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
     MISS,
@@ -38,6 +38,8 @@ from striptools.trace.walk import (
     SLACK,
     STUCK,
     WIDTH,
+    Decode,
+    Leaf,
     Place,
     Traced,
     WalkOptions,
@@ -49,20 +51,6 @@ FAR = np.float32(3.0e38)
 
 RAY_OVER_TRIANGLE = np.float32(0.5)
 """What a ray against all triangles of a leaf costs, over a triangle against all rays."""
-
-
-class LeafRows(NamedTuple):
-    """The triangles of a leaf, for any axis.
-
-    Attributes:
-        axes: Corners a, b, c along the three axes asked for, (8,) float32 each; NaN where there is none.
-        name: (8,) int32, what the scene calls them; `NO_NAME` where there is none.
-        turn: (8,) int32, which corner is the first in the canonical order; None where that is corner a.
-    """
-
-    axes: tuple[Corners, Corners, Corners]
-    name: Array
-    turn: Array | None
 
 
 class PacketScene(WalkScene, Protocol):
@@ -81,8 +69,8 @@ class PacketScene(WalkScene, Protocol):
         """Sides of the box in one lane, () float32 each, as of `sides_of`."""
         ...
 
-    def leaf_rows(self, child: Array, axes: tuple[Array, Array, Array]) -> LeafRows:
-        """The triangles of a leaf."""
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """`leaf_of` for one leaf and many rays."""
         ...
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
@@ -250,10 +238,10 @@ def _next_bit(bits: Array) -> tuple[Array, Array]:
     return place, bits & ~(jnp.uint32(1) << place)
 
 
-class _Leaf(NamedTuple):
-    """A leaf at hand: its triangles, and which of them and which rays are left."""
+class _Sifted(NamedTuple):
+    """A leaf at hand, and which of its triangles and which rays are left, as bits."""
 
-    rows: LeafRows
+    leaf: Leaf
     triangles: Array
     rays: Array
 
@@ -264,31 +252,35 @@ def _sides(corners: Sequence[Array]) -> tuple[Array, Array]:
     return smaller(smaller(a, b), c), larger(larger(a, b), c)
 
 
-def _sifted(packet: _Packet, rows: LeafRows, around: _Box, found: _Found) -> _Leaf:
+def _sifted(packet: _Packet, leaf: Leaf, around: _Box, found: _Found) -> _Sifted:
     """The triangles whose boxes the frustum meets, and the rays that meet the leaf's box."""
-    sides = [_sides(corners) for corners in rows.axes[:2]]
-    sides.append(_sides([corner * packet.sign for corner in rows.axes[2]]))
-    met = _meets(packet, _Box(*sides), found.limit)
-    return _Leaf(rows, _bits(met), _bits(_rays_in(packet, around, found.t)))
+    ahead = [corner * packet.sign for corner in leaf.z]
+    met = _meets(packet, _Box(_sides(leaf.x), _sides(leaf.y), _sides(ahead)), found.limit)
+    if leaf.filled is not None:
+        met = met & leaf.filled
+    return _Sifted(leaf, _bits(met), _bits(_rays_in(packet, around, found.t)))
 
 
-def _test_leaf(packet: _Packet, leaf: _Leaf, found: _Found, options: WalkOptions) -> _Found:
+def _test_leaf(
+    scene: PacketScene, packet: _Packet, sifted: _Sifted, found: _Found, options: WalkOptions
+) -> _Found:
     """Test a leaf by its rays or by its triangles."""
-    triangles, rays = (lax.population_count(bits).astype(jnp.float32) for bits in leaf[1:])
+    leaf = sifted.leaf
+    triangles, rays = (lax.population_count(bits).astype(jnp.float32) for bits in sifted[1:])
     by_ray = rays * RAY_OVER_TRIANGLE < triangles
     none = jnp.uint32(0)
 
     def test_ray(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
-        return left, *_one_ray(packet, leaf.rows, lane, state[1], state[2])
+        return left, *_one_ray(scene, packet, leaf, lane, state[1], state[2])
 
     def test_triangle(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
-        return left, *_one_triangle(packet, leaf.rows, lane, state[1], state[2])
+        return left, *_one_triangle(scene, packet, leaf, lane, state[1], state[2])
 
-    state = (jnp.where(by_ray, leaf.rays, none), found.t, found.name)
+    state = (jnp.where(by_ray, sifted.rays, none), found.t, found.name)
     state = lax.while_loop(lambda s: s[0] != 0, test_ray, state)
-    state = (jnp.where(by_ray | (leaf.rays == 0), none, leaf.triangles), *state[1:])
+    state = (jnp.where(by_ray | (sifted.rays == 0), none, sifted.triangles), *state[1:])
     _, t, name = lax.while_loop(lambda s: s[0] != 0, test_triangle, state)
     if options.any_hit:
         # A ray that has hit something reaches no farther.
@@ -296,36 +288,58 @@ def _test_leaf(packet: _Packet, leaf: _Leaf, found: _Found, options: WalkOptions
     return _Found(t, name, _limit(packet, t))
 
 
-def _one_ray(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: Array) -> tuple[Array, Array]:
+def _faces_of(scene: PacketScene, names: Array) -> Array:
+    """What orders hits at the same t."""
+    return scene.faces_of(names) if scene.has_faces else names
+
+
+def _one_ray(
+    scene: PacketScene, packet: _Packet, leaf: Leaf, lane: Array, t: Array, name: Array
+) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
-    crossing = crossing_of(edges_of(*rows.axes, packet.shear_of(lane)), rows.turn)
+    crossing = leaf.crossings(packet.shear_of(lane))
     old = lax.dynamic_slice(t, (lane,), (1,))[0]
-    hit = (crossing > 0) & (crossing <= old) & (rows.name != NO_NAME)
+    hit = (crossing > 0) & (crossing <= old)
 
     def replace() -> tuple[Array, Array]:
         nearest = folded(jnp.where(hit, crossing, jnp.inf), smaller)
-        least = folded(jnp.where(hit & (crossing == nearest), rows.name, NO_NAME), smaller)
+        held = hit & (crossing == nearest)
+        faces = jnp.where(held, _faces_of(scene, jnp.where(held, leaf.name, 0)), NO_NAME)
+        least = folded(faces, smaller)
+        mine = folded(jnp.where(faces == least, leaf.name, NO_NAME), smaller)
         old_name = lax.dynamic_slice(name, (lane,), (1,))[0]
-        least = jnp.where((nearest < old) | (least < old_name), least, old_name)
+        before = _faces_of(scene, old_name[None])[0]
+        mine = jnp.where((nearest < old) | (least < before), mine, old_name)
         return (
             lax.dynamic_update_slice(t, nearest[None], (lane,)),
-            lax.dynamic_update_slice(name, least[None], (lane,)),
+            lax.dynamic_update_slice(name, mine[None], (lane,)),
         )
 
     return lax.cond(_bits(hit) != 0, replace, lambda: (t, name))
 
 
-def _one_triangle(packet: _Packet, rows: LeafRows, lane: Array, t: Array, name: Array) -> tuple[Array, Array]:
+def _one_triangle(
+    scene: PacketScene, packet: _Packet, leaf: Leaf, lane: Array, t: Array, name: Array
+) -> tuple[Array, Array]:
     """Test one triangle against all rays."""
 
     def of_triangle(values: Array) -> Array:
         return lax.dynamic_slice(values, (lane,), (1,))[0]
 
-    x, y, z = ((of_triangle(a), of_triangle(b), of_triangle(c)) for a, b, c in rows.axes)
-    turn = None if rows.turn is None else of_triangle(rows.turn)
+    x, y, z = ((of_triangle(a), of_triangle(b), of_triangle(c)) for a, b, c in (leaf.x, leaf.y, leaf.z))
+    turn = None if leaf.turn is None else of_triangle(leaf.turn)
     crossing = crossing_of(edges_of(x, y, z, packet.shear), turn)
-    mine = of_triangle(rows.name)
-    closer = (crossing > 0) & ((crossing < t) | ((crossing == t) & (mine < name)))
+    mine = of_triangle(leaf.name)
+    tied = (crossing > 0) & (crossing == t)
+    if scene.has_faces:
+
+        def first() -> Array:
+            return tied & (scene.faces_of(mine[None])[0] < scene.faces_of(name))
+
+        tied = lax.cond(_bits(tied) != 0, first, lambda: tied)
+    else:
+        tied = tied & (mine < name)
+    closer = (crossing > 0) & (crossing < t) | tied
     return jnp.where(closer, crossing, t), jnp.where(closer, mine, name)
 
 
@@ -374,9 +388,9 @@ def _walk_packet(
 
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
         place = state.place
-        rows = scene.leaf_rows(place.child, packet.axes)
-        leaf = _sifted(packet, rows, _box_of(scene, packet, place), found)
-        found = _test_leaf(packet, leaf, found, options)
+        leaf = scene.leaf_for_packets(packet.axes, place.child, options.decode)
+        sifted = _sifted(packet, leaf, _box_of(scene, packet, place), found)
+        found = _test_leaf(scene, packet, sifted, found, options)
         there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
         done = found.limit < 0
         return there._replace(child=jnp.where(done, DONE, there.child)), found

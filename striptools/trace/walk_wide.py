@@ -11,7 +11,7 @@ from striptools.trace.leaf_blocks import corners_in, faces_in, test_block, trian
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import WIDTH, Best, Decode, Frame, Leaf, Traced, WalkOptions, walk_rays
-from striptools.trace.walk_packets import LeafRows, walk_packets
+from striptools.trace.walk_packets import walk_packets
 
 
 class WideScene(NamedTuple):
@@ -66,6 +66,10 @@ class WideScene(NamedTuple):
         leaf = index(-(child + 1))
         return Leaf(*corners_in(self.blocks, leaf, axes), None, None, faces_in(self.blocks, leaf))
 
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+        """The same: nothing is decoded."""
+        return self.leaf_of(axes, child, decode)
+
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""
         at = index(node)
@@ -75,11 +79,6 @@ class WideScene(NamedTuple):
     def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
         """Sides of the box in one lane."""
         return [lax.dynamic_slice(self.nodes, (index(node), row, lane), (1, 1, 1))[0, 0, 0] for row in rows]
-
-    def leaf_rows(self, child: Array, axes: tuple[Array, Array, Array]) -> LeafRows:
-        """The triangles of a leaf along the axes."""
-        leaf = index(-(child + 1))
-        return LeafRows(corners_in(self.blocks, leaf, axes), faces_in(self.blocks, leaf), None)
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk packets made ready."""

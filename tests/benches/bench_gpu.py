@@ -1,12 +1,14 @@
 """Tracing on a GPU against the CPU path in the same process: the same hits, and rays a second.
 
     python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5]
-        [--resident expanded compressed] [--record] [--note TEXT]
+        [--resident expanded compressed] [--under slbvh ...] [--twin] [--record] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed; ambient
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
 sphere. Every answer of the GPU is compared with the CPU's: a difference in face or in a bit of t counts.
-Seconds are those of a whole call, transfers and weighing of hits included. `--record` appends the figures to
+Rates are given of whole calls, transfers and weighing of hits included, and of the device alone: rays made
+ready and walked, rays and results in its memory. `--twin` measures there the kernel's plain-JAX twin
+too; hierarchies named by `--under` have no kernel and are walked by vmap. `--record` appends the figures to
 `results.csv`.
 """
 
@@ -14,14 +16,19 @@ import argparse
 import sys
 import time
 from pathlib import Path
+from typing import get_args
 
 import jax
 import numpy as np
 from results import Row, append
 
 import striptools
+from striptools.hierarchies.options import HierarchyOptions
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
+from striptools.trace.device import quiet_jax
+from striptools.trace.launch import program
+from striptools.trace.pallas.walk import RAYS
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import ResidentKind
 
@@ -37,7 +44,9 @@ def main() -> int:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--rays", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--resident", nargs="+", default=["expanded", "compressed"])
+    parser.add_argument("--resident", nargs="*", default=["expanded", "compressed"])
+    parser.add_argument("--under", nargs="*", default=[])
+    parser.add_argument("--twin", action="store_true")
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--note", default="")
     arguments = parser.parse_args()
@@ -47,29 +56,31 @@ def main() -> int:
     differ = 0
     for path in arguments.models:
         scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
-        rows = [row for kind in arguments.resident for row in measure(path.stem, scene, kind, arguments)]
-        for row in rows:
-            sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.6g} {row.unit} ({row.note})\n")
-            sys.stdout.flush()
-            differ += int(row.value) if row.metric.startswith("differing") else 0
-        if arguments.record:
-            append(rows)
+        cpu = Tracer(scene, device="cpu", resident="expanded")
+        for what in (*arguments.resident, *arguments.under):
+            rows = measure(path.stem, scene, what, cpu, arguments)
+            for row in rows:
+                sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.6g} {row.unit} ({row.note})\n")
+                sys.stdout.flush()
+                differ += int(row.value) if row.metric.startswith("differing") else 0
+            if arguments.record:
+                append(rows)
     return 1 if differ else 0
 
 
-def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse.Namespace) -> list[Row]:
-    """Trace every kind of ray on both devices."""
-    gpu = Tracer(scene, device="gpu", resident=resident)
-    cpu = Tracer(scene, device="cpu", resident="expanded")
+def measure(name: str, scene: Scene, what: str, cpu: Tracer, arguments: argparse.Namespace) -> list[Row]:
+    """Trace every kind of ray on both devices; `what` is a residency or another hierarchy."""
+    if what in get_args(ResidentKind):
+        gpu = Tracer(scene, device="gpu", resident=what)  # pyright: ignore[reportArgumentType]
+    else:
+        gpu = Tracer(scene.under(HierarchyOptions(what)), device="gpu")  # pyright: ignore[reportArgumentType]
     device = str(gpu.devices[0].device_kind)
     rows = []
     for kind, rays in ray_kinds(scene, cpu, 2**arguments.rays):
-        ours, wanted = gpu.closest_hit(*rays), cpu.closest_hit(*rays)
+        ours, wanted = gpu.closest_hit(*rays), cpu.closest_hit(*rays, packets=False)
         wrong = int(((ours.face != wanted.face) | (ours.t.view(np.int32) != wanted.t.view(np.int32))).sum())
         wrong_any = int((gpu.any_hit(*rays) != (wanted.face >= 0)).sum())
-        note = "; ".join(
-            filter(None, [f"{device}, {resident}, {len(rays[0])} rays, whole calls", arguments.note])
-        )
+        note = "; ".join(filter(None, [f"{device}, {what}, {len(rays[0])} rays", arguments.note]))
         count = scene.triangle_count
         rows += [
             Row("gpu", name, count, f"differing closest hits, {kind}", wrong, "rays", note=note),
@@ -77,7 +88,32 @@ def measure(name: str, scene: Scene, resident: ResidentKind, arguments: argparse
             rate(name, count, f"{kind} rays, closest hit", gpu.closest_hit, rays, arguments.repeats, note),
             rate(name, count, f"{kind} rays, any hit", gpu.any_hit, rays, arguments.repeats, note),
         ]
+        for twin in (False, True)[: 1 + arguments.twin]:
+            for any_hit, asked in ((False, "closest hit"), (True, "any hit")):
+                value, by = device_rate(gpu, rays, arguments.repeats, any_hit=any_hit, twin=twin)
+                metric = f"{kind} rays, {asked}, {by}, on the device alone"
+                rows.append(Row("gpu", name, count, metric, value, "Mray/s", note=note))
     return rows
+
+
+def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin: bool) -> tuple[float, str]:
+    """Millions of rays a second of many calls in a row, rays and results in the device's memory; by what."""
+    count = len(rays[0]) // RAYS * RAYS
+    options = tracer._options(any_hit=any_hit)
+    assert options is not None
+    if twin:
+        options = options._replace(kernel=False)
+    run = program(tracer._mesh, options)
+    reach = np.full(count, np.inf, np.float32)
+    given = jax.device_put((rays[0][:count], rays[1][:count], reach), tracer.devices[0])
+    calls, best = 20 if options.kernel else 1, np.inf
+    with quiet_jax():
+        for _ in range(repeats + 1):
+            start = time.perf_counter()
+            jax.block_until_ready([run(tracer._scene, *given) for _ in range(calls)])
+            best = min(best, time.perf_counter() - start)
+    by = "kernel" if options.kernel else "twin" if twin else "vmap"
+    return calls * count / best / 1e6, by
 
 
 def rate(name: str, count: int, metric: str, call: object, rays: Rays, repeats: int, note: str) -> Row:
@@ -98,7 +134,7 @@ def ray_kinds(scene: Scene, cpu: Tracer, count: int) -> list[tuple[str, Rays]]:
         np.ascontiguousarray(r.reshape(tiles, TILE, tiles, TILE, 3).swapaxes(1, 2).reshape(-1, 3))
         for r in camera_rays(camera)
     )
-    hits = cpu.closest_hit(origins, directions)
+    hits = cpu.closest_hit(origins, directions, packets=False)
     met = np.flatnonzero(hits.face >= 0)
     corners = scene.positions[scene.faces()[hits.triangle[met]]].astype(np.float64)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,0 +1,253 @@
+"""The walk of a scene whose geometries stand in several places: a hierarchy over instances, and theirs below.
+
+Each geometry's nodes and triangles are there once. A leaf of the hierarchy over instances is one instance:
+the ray is moved into the geometry's frame, where the walk of one ray goes on from the geometry's root, with a
+stack of its own, and the closest hit is carried back.
+
+1. The direction is moved without being made of unit length, so that t stays the parameter of the same ray.
+   All scaling is by powers of two.
+2. Inside a geometry everything is as without instances: the same boxes, the same watertight test, of the ray
+   as it was rounded there. No ray slips through between two triangles of an instance, mirrored or stretched.
+3. The moved ray is rounded by separate products and sums (`numerics.rounded`): its bits, and the hits, are
+   the same on every platform.
+4. Of two hits at the same t that of the first instance is kept: faces of the flattened source are numbered
+   in the order of instances.
+
+**Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w
+move a ray into it: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d the
+moved one is off by
+
+    e = gamma_4 (|W||o| + |w|) in the origin,   gamma_3 |W||d| in the direction,
+
+so that the point P that it reaches at t and the place Q of the point that is hit in the geometry differ by
+
+    |P - Q| <= |A| e + gamma_3 |A||W||t d| + |E| (|o| + |t d|) + |r|,   |t d| <= |o| + |Q| + |P - Q|.
+
+Let k be the largest row sum of |A||W|, n that of |E|, h the largest entry of |A||w|, and s the largest of |o|
+and of the placed scene. The point hit may lie 6 u M outside the geometry's box, M the largest coordinate
+there of origin and geometry (`box`, difference 1), which A enlarges to 6 u (k s + h + a), a the largest row
+sum of |A| times the geometry's largest coordinate. All in all Q is within f s of the ray, for
+
+    f s = ((gamma_4 k + n) s + 2 (gamma_3 k + n) s + gamma_4 h + |r|) / (1 - gamma_3 k - n)
+          + 6 u (k s + h + a)
+
+and an instance whose box, widened by f s, the ray does not meet before the closest hit has nothing to say.
+`instanced` computes f, and each lane of a node holds the largest f below it. For turned and evenly scaled
+instances it is about 2^-18.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from striptools.trace.box import Slab, lanes_met
+from striptools.trace.counters import Counters
+from striptools.trace.numerics import index, larger, rounded
+from striptools.trace.triangle import Shear
+from striptools.trace.walk import (
+    DONE,
+    MISS,
+    STUCK,
+    WIDTH,
+    Frame,
+    ReadyRay,
+    WalkOptions,
+    found_alone,
+    largest_of,
+    prepared_ray,
+    scaled_ray,
+    walk_alone,
+)
+
+NODE_BYTES = 256
+"""What a node over instances reads: eight boxes, children, and factors."""
+
+INSTANCE_BYTES = 60
+"""What an instance reads: its matrix, root, reach and number."""
+
+
+class InstancedScene(NamedTuple):
+    """A scene as arrays on a device.
+
+    Attributes:
+        nodes: (w, 8, 8) float32, over instances: six rows of boxes, scaled, NaN in empty lanes; the bits of
+            the children, instance i as -(i + 1); and what boxes are widened by, in units of the largest
+            coordinate of ray origin and scene. The last node has no children.
+        matrices: (k, 3, 4) float32, from the scaled scene to the scaled geometry.
+        roots: (k,) int32, the root of each instance's geometry.
+        reaches: (k,) float32, the largest scaled coordinate of its geometry.
+        frame: How rays are seen from the scene.
+        geometries: All geometries, in their own frames.
+    """
+
+    nodes: Any
+    matrices: Any
+    roots: Any
+    reaches: Any
+    frame: Frame
+    geometries: Any
+
+    def visited(self, top: Array, below: Array) -> Array:
+        """(6,) int32, `Counters` of so many nodes, leaves and triangles over instances and in geometries."""
+        nodes, instances, _ = top
+        above = Counters(nodes, 0, nodes * 8, 0, nodes * NODE_BYTES, instances * INSTANCE_BYTES)
+        inside = self.geometries.counters_of(*below)
+        return jnp.stack([jnp.int32(a + b) for a, b in zip(above, inside, strict=True)])
+
+
+class InstancesTraced(NamedTuple):
+    """One entry a ray; what was not asked for has none.
+
+    Attributes:
+        t: (r,) float32; (0,) of any hit.
+        name: (r,) int32, what the geometries call the triangle hit.
+        counters: (r, 6) int32; (r, 0) where nothing is counted.
+        instance: (r,) int32, -1 on a miss.
+    """
+
+    t: Array
+    name: Array
+    counters: Array
+    instance: Array
+
+
+class _Nearest(NamedTuple):
+    """The closest hit so far, in t of the walk over instances; what was visited in geometries."""
+
+    nearest: Array
+    name: Array
+    instance: Array
+    stuck: Array
+    visits: Array
+
+
+class _Seen(NamedTuple):
+    """A scene as one ray sees it: a `walk.WalkScene` whose leaves are instances."""
+
+    scene: InstancedScene
+    origin: Array
+    direction: Array
+    size: Array
+
+    @property
+    def frame(self) -> Frame:
+        """How rays are seen."""
+        return self.scene.frame
+
+    @property
+    def node_count(self) -> int:
+        """Nodes over instances."""
+        return len(self.scene.nodes)
+
+    def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
+        """(8,) bool: the node's children whose widened boxes the ray meets, from 0 to `limit`."""
+        at = (index(node), jnp.uint32(0), jnp.uint32(0))
+        rows = lax.dynamic_slice(self.scene.nodes, at, (1, 8, WIDTH))[0]
+        wider = rows[7] * self.size
+        return lanes_met(jnp.concatenate([rows[:3] - wider, rows[3:6] + wider]), slab, limit)
+
+    def child_of(self, node: Array, lane: Array) -> Array:
+        """The child in a lane; instance i is -(i + 1)."""
+        bits = lax.dynamic_slice(self.scene.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
+        return lax.bitcast_convert_type(bits, jnp.int32)
+
+    def triangles_of(self, child: Array) -> Array:
+        """Triangles are counted in the geometries."""
+        return jnp.int32(0)
+
+    def visit_leaf(self, shear: Shear, child: Array, best: _Nearest, options: WalkOptions) -> _Nearest:
+        """Walk the geometry of an instance."""
+        number = -(child + 1)
+        at = index(number)
+        matrix = lax.dynamic_slice(self.scene.matrices, (at, jnp.uint32(0), jnp.uint32(0)), (1, 3, 4))[0]
+        origin, direction = moved(matrix, self.origin, self.direction)
+        geometries = self.scene.geometries
+        frame = geometries.frame._replace(scale=jnp.float32(1), reach=_at(self.scene.reaches, at))
+        seen = geometries._replace(frame=frame)
+        # Once there is a hit, one just as near may be of an instance before it.
+        limit = jnp.where(best.instance >= 0, _next_above(best.nearest), best.nearest)
+        # A GPU goes through the motions for rays that are at no leaf.
+        there = (child < 0) & (child != DONE)
+        row = prepared_ray(seen, origin, direction, jnp.where(there, limit, 0), _at(self.scene.roots, at))
+        end = walk_alone(seen, row, options)
+        t, name = found_alone(seen, end, options.any_hit)
+        closer = (name >= 0) & ((t < best.nearest) | (t == best.nearest) & (number < best.instance))
+        return _Nearest(
+            jnp.where(closer, t, best.nearest),
+            jnp.where(closer, name, best.name),
+            jnp.where(closer, number, best.instance),
+            best.stuck | (name == STUCK),
+            best.visits + end.visits,
+        )
+
+
+def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]:
+    """A ray in the frame of a geometry: ((m0 x + m1 y) + m2 z) + m3, every step rounded.
+
+    Args:
+        matrix: (3, 4) float32.
+        origin: (3,) float32.
+        direction: (3,) float32.
+    """
+
+    def turned(vector: Array) -> Array:
+        x, y, z = (rounded(matrix[:, axis] * vector[axis]) for axis in range(3))
+        return (x + y) + z
+
+    return turned(origin) + matrix[:, 3], turned(direction)
+
+
+def trace_instances(
+    scene: InstancedScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+) -> InstancesTraced:
+    """Trace r rays.
+
+    Args:
+        scene: What to trace.
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+        t_max: (r,) float32.
+        options: What to compile in; rays go one by one, or all at once (`batch`).
+    """
+    options = options._replace(interleave=1)
+
+    def walk(*ray: Array) -> InstancesTraced:
+        return _walk_ray(scene, ray, options)
+
+    rays = (origins, directions, t_max)
+    if options.batch:
+        found = jax.vmap(walk)(*rays)
+    else:
+        found = lax.scan(lambda nothing, ray: (nothing, walk(*ray)), None, rays)[1]
+    return found._replace(t=jnp.zeros(0)) if options.any_hit else found
+
+
+def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions) -> InstancesTraced:
+    """Walk one ray over the instances."""
+    origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
+    seen = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
+    row = prepared_ray(seen, ray[0], ray[1], ray[2], jnp.int32(0))
+    none = jnp.int32(MISS)
+
+    def nothing(ready: ReadyRay) -> _Nearest:
+        return _Nearest(ready.t_max, none, none, jnp.bool_(False), jnp.zeros(3, jnp.int32))
+
+    ready, ended, best, visits = walk_alone(seen, row, options, nothing)
+    hit = best.instance >= 0
+    t = jnp.where(hit, best.nearest * ready.t_unit, jnp.float32(jnp.inf))
+    name = jnp.where(ended & ~best.stuck, best.name, STUCK)
+    counters = scene.visited(visits, best.visits) if options.counting else jnp.zeros(0, jnp.int32)
+    return InstancesTraced(t, name, counters, best.instance)
+
+
+def _at(values: Array, place: Array) -> Array:
+    return lax.dynamic_slice(values, (place,), (1,))[0]
+
+
+def _next_above(value: Array) -> Array:
+    """The float32 after a positive one; infinity stays."""
+    bits = lax.bitcast_convert_type(value, jnp.int32)
+    after = lax.bitcast_convert_type(bits + 1, jnp.float32)
+    return jnp.where(jnp.isfinite(value), after, value)
