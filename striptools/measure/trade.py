@@ -12,7 +12,8 @@ What is measured of a point, in diagonals of the model where it is a length:
    declared bound is what the file says, or the certified bound of the surfaces.
 3. Errors of t and of normals at the rays that hit in both, against the source's face in float64. A ray is
    wrong where it hits and the source's does not, or the other way, or where its t is `JUMP` diagonals off: it
-   then is on another part of the surface.
+   then is on another part of the surface. Secondary rays start at the source's surface, so that where a
+   point's lies outside of it they hit it at once: that counts, as it would in a renderer with baked origins.
 4. Leaks and disagreements are those of `verify`: the scene against the mesh that it was made from.
 5. Pictures: the default's and the point's by one camera; PSNR, FLIP where it is installed, and how many of a
    million pixels change between hit and miss (the silhouette).
