@@ -5,7 +5,8 @@ import numpy as np
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
-from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner, weigh_corners
+from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, give_weights, take_ray, weigh_chunk
+from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner
 
 
 @kernel
@@ -232,40 +233,44 @@ def weigh_packed_hits(
         v: (r,) float32, written: the weight of its third corner.
         triangle: (r,) int32, written; -1 on a miss.
     """
-    weights = np.zeros(3, np.float32)
-    room = np.zeros((4, 3), np.float32)
     decoded = np.zeros((3, 3), np.float32)
-    corners = np.zeros((3, 3), np.float32)
+    room = np.zeros(ROOM, np.float32)
+    ray_of = np.zeros(CHUNK, np.int32)
+    turn_of = np.zeros(CHUNK, np.int32)
+    held = 0
     for k in range(len(at)):
         r = at[k]
-        if r < 0:
-            continue
-        t[r] = found_t[k]
-        if found[k] < 0:
-            face[r] = found[k]
-            triangle[r] = -1
-            u[r] = 0.0
-            v[r] = 0.0
-            continue
-        block = np.int64(found[k]) >> 8
-        place = np.int64(found[k]) & 255
-        number = np.int64(headers[block, 0]) + place
-        triangle[r] = number
-        face[r] = faces[number] if len(faces) > 0 else number
+        if r >= 0:
+            t[r] = found_t[k]
+            if found[k] < 0:
+                face[r] = found[k]
+                triangle[r] = -1
+                u[r] = 0.0
+                v[r] = 0.0
+            else:
+                block = np.int64(found[k]) >> 8
+                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
+                triangle[r] = number
+                face[r] = faces[number] if len(faces) > 0 else number
 
-        # Decode the triangle, and turn it as the tests do.
-        bit = np.int64(headers[block, 1]) << 5
-        counts = block_counts(headers, block)
-        indices = corner_indices(words, bit, counts, place)
-        scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
-        turn = first_corner(decoded)
-        for j in range(3):
-            for axis in range(3):
-                corners[j, axis] = decoded[(j + turn) % 3, axis]
+                # Decode the triangle, and turn it as the tests do.
+                bit = np.int64(headers[block, 1]) << 5
+                counts = block_counts(headers, block)
+                indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
+                scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
+                turn = first_corner(decoded)
+                axes = take_ray(origins, directions, r, room, held)
+                for axis in range(3):
+                    for j in range(3):
+                        corner = decoded[(j + turn) % 3, axes[axis]]
+                        room[CORNERS + (3 * axis + j) * CHUNK + held] = corner
 
-        # Weigh its corners, named as the reported face does.
-        if len(rotations) > 0:
-            turn = (turn + rotations[number]) % 3
-        weigh_corners(origins, directions, r, scale, corners, turn, room, weights)
-        u[r] = weights[1]
-        v[r] = weights[2]
+                # Name its corners as the reported face does.
+                ray_of[held] = r
+                turn_of[held] = (turn + rotations[number]) % 3 if len(rotations) > 0 else turn
+                held += 1
+        if held == CHUNK or (held > 0 and k == len(at) - 1):
+            weigh_chunk(room, scale)
+            for i in range(held):
+                give_weights(room, i, turn_of[i], ray_of[i], u, v)
+            held = 0

@@ -38,18 +38,39 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    tried, and the 8 delta_v are a demand: rounding alone could accept an edge-on face far away.
 6. t. The reported z is a convex combination of the z_i, so z lies in [min z_i, max z_i] and
 
-       |z - z_exact| <= min(|grad z| delta_v + sum rho_i |z_i - z_exact| / det_low, max z_i - min z_i) +
-       gamma_12 M + D,
+       |z - z_exact| <= min(|grad z| delta_0 + sum rho_i |z_i - z_exact| / det_low + k D, max z_i - min z_i +
+       D) + gamma_12 M,
 
-   with grad z the slope of the face's plane over the sheared plane: the tangent of the angle of incidence,
-   which is how the error grows like 1/|cos| at grazing rays. z_exact is the plane's z at the ray, clamped to
-   the face's range. The last rounding terms are those of the sum itself (a_z, 1/d_z, three products, four
-   sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for products that
-   underflow.
+   with delta_0 = delta_v - sqrt(3) D, and grad z the slope of the face's plane over the sheared plane: the
+   tangent of the angle of incidence, which is how the error grows like 1/|cos| at grazing rays. z_exact is
+   the plane's z at the ray, clamped to the face's range. k D is D over the cosine: the reported point has
+   weights whose point of the source's face lies within D, so it is within D of the source's plane, of unit
+   normal n, and along m = (S_x, S_y, 1) as far as D / |n m|. From n = (-grad z, 1 + S grad z) / k follows k
+   = 1 / |n m| = sqrt(|grad z|^2 + (1 + S grad z)^2), and |d| |t - t_exact| <= D |m| / |n m| = D / |cos|,
+   where there is no rounding. The last rounding terms are those of the sum itself (a_z, 1/d_z, three
+   products, four sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for
+   products that underflow.
 7. u and v come from the same weights. Weights of one sign make sum U_i p_i / det a point of the moved face,
    within stray = sum rho_i (|p_i| + delta_v) / det_low of the ray; u and v have four more roundings. So the
    point (1-u-v) v0 + u v1 + v v2 of the source's corners lies within delta_v + min(stray, max |p_i|) +
    gamma_16 M of the ray in the sheared plane, and its z within gamma_16 M + D of t d_z.
+8. How they add up. **The hit point, everywhere**: the point of face, u and v on the source lies within
+   lateral + sqrt(3) (gamma_16 M + D) of o + t d (7; sqrt(3) for z along the ray), and within D of the traced
+   one, whatever the ray: `hit_point_bound`. **t, per ray**: 6, that is D over the cosine and the rounding's
+   part. D itself, a scene's `error_bound`, is the sum of what moved a vertex: welding, rounding from doubles
+   (sqrt(3) of the largest), half a cell on each axis of a grid (sqrt(3) / 2 cells, `reducem.quantize`);
+   none of them knows of the others. (Doubles without an origin of their own are rounded first: then the
+   float32 mesh counts as the source, and the rounding is told by the conversion's report.)
+9. A box. With the tracer's own order of operations a sheared coordinate near 0 has four roundings (a_x, a_z,
+   S, the product), so it moves by at most gamma_4 M, M <= 2 L with L the largest coordinate of ray and scene;
+   a face whose corners straddle the ray after that lies within gamma_4 M of it in x and in y. A certain face
+   needs no more than the slab test's own rounding, since the exact ray meets its box; the widening is for
+   faces that are accepted by rounding, so that every hierarchy finds the same: `trace.box` and
+   `trace.walk_packed` derive theirs. `beyond_box` tells how much a reported hit needed.
+
+**Tracers scale** positions and rays by powers of two, which is exact: the bound is that of the scaled frame,
+where the scene's largest coordinate is 1 to 2 and the direction's too. There the flushed terms are relative
+to the scene, and M < 2^40 is a distance in parts of it: `extremes` judges in that frame.
 
 The bound holds while no product overflows: M < 2^40. Beyond that nothing is called certain. Its own
 arithmetic is float64, whose rounding is 2^-29 of the terms above; a face that it cannot tell from a line,
@@ -65,6 +86,9 @@ LARGEST_COORDINATE = 2.0**40
 FLUSHED = 2.0**-122
 EDGE_ON = 2.0**-50
 """A face whose doubled area is a smaller part of the products it is made of has none: float64 rounding."""
+
+BISECTIONS = 90
+"""Thirds taken off an interval until float64 has no more to say."""
 
 BEYOND_FACE = 8.0
 """How many delta_v from the ray a face may lie and still be reported (term 5 of the head)."""
@@ -178,14 +202,14 @@ def judge_pairs(frames: RayFrames, ray: np.ndarray, corners: np.ndarray, error_b
         corners: (k, 3, 3) float64, the face's corners, whose components are float32 values.
         error_bound: D, how far the traced vertices may lie off these, in the model's unit.
     """
-    largest = np.abs(corners - frames.origins[ray][:, None]).max(axis=(1, 2))
+    largest = np.abs(corners - frames.origins[ray][:, None]).max(axis=(1, 2)) + error_bound
     delta_v = lateral_slack(largest, error_bound)
     sheared = shear_points(frames, ray, corners)
     x, y, z = sheared[..., 0].T, sheared[..., 1].T, sheared[..., 2].T
     with np.errstate(all="ignore"):
         plane = _PlaneView(x, y, z, delta_v)
         depth = np.abs(frames.depth[ray])
-        z_hit, z_bound = plane.depth_and_bound(gamma(12) * largest + error_bound)
+        z_hit, z_bound = plane.depth_and_bound(gamma(12) * largest, frames.shear[ray].T, error_bound)
         t_bound = z_bound / depth + np.where(plane.det_low > 0, FLUSHED / plane.det_low, 0.0)
         t = z_hit / frames.depth[ray]
         t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
@@ -250,7 +274,9 @@ class _PlaneView:
         boxed &= (self.y.min(axis=0) <= reach) & (self.y.max(axis=0) >= -reach)
         return either & boxed | np.isinf(reach)
 
-    def depth_and_bound(self, rounding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def depth_and_bound(
+        self, rounding: np.ndarray, shear: np.ndarray, error_bound: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Depth of the face's plane at the ray, clamped to the face's range, and the bound of its error."""
         x, y, z = self.x, self.y, self.z
         low, high = z.min(axis=0), z.max(axis=0)
@@ -258,9 +284,45 @@ class _PlaneView:
         depth = np.where(self.det != 0, (self.cross * (z - z[0])).sum(axis=0) / det + z[0], z[0])
         depth = np.clip(depth, low, high)
         rise_1, rise_2 = z[1] - z[0], z[2] - z[0]
-        slope_x = rise_1 * (x[2] - x[0]) - rise_2 * (x[1] - x[0])
-        slope_y = rise_1 * (y[2] - y[0]) - rise_2 * (y[1] - y[0])
-        slope = np.hypot(slope_x, slope_y) / np.abs(det)
-        stray = slope * self.delta_v + (self.rho * np.abs(z - depth)).sum(axis=0) / self.det_low
+        slope_x = (rise_1 * (y[2] - y[0]) - rise_2 * (y[1] - y[0])) / det
+        slope_y = (rise_2 * (x[1] - x[0]) - rise_1 * (x[2] - x[0])) / det
+        slope = np.hypot(slope_x, slope_y)
+        over_cosine = error_bound * np.hypot(slope, 1 + shear[0] * slope_x + shear[1] * slope_y)
+        stray = slope * (self.delta_v - np.sqrt(3.0) * error_bound) + over_cosine
+        stray += (self.rho * np.abs(z - depth)).sum(axis=0) / self.det_low
         stray = np.where(self.det_low > 0, stray, np.inf)
-        return depth, np.minimum(stray, high - low) + rounding
+        return depth, np.minimum(stray, high - low + error_bound) + rounding
+
+
+def hit_point_bound(pairs: Pairs) -> np.ndarray:
+    """(k,) float64: how far the point of face, u and v may lie from o + t d (term 8 of the head)."""
+    return pairs.lateral + np.sqrt(3.0) * pairs.depth_error
+
+
+def beyond_box(frames: RayFrames, ray: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """By how much the boxes of faces must be widened for their rays to meet them (term 9 of the head).
+
+    Args:
+        frames: The rays.
+        ray: (k,) index of each pair's ray.
+        corners: (k, 3, 3) float64.
+
+    Returns:
+        (k,) float64, 0 where the ray meets the box as it is.
+    """
+    low, high = corners.min(axis=1) - frames.origins[ray], corners.max(axis=1) - frames.origins[ray]
+    way = frames.directions[ray]
+
+    def outside(t: np.ndarray) -> np.ndarray:
+        at = t[:, None] * way
+        return np.maximum(np.maximum(low - at, at - high), 0.0).max(axis=1)
+
+    # The distance is convex in t, and least between the places where the main axis enters and leaves.
+    z = frames.axes[ray, 2:]
+    ends = np.take_along_axis(np.stack([low, high]), z[None], axis=2)[..., 0] / frames.depth[ray]
+    begin, end = ends.min(axis=0), ends.max(axis=0)
+    for _ in range(BISECTIONS):
+        one, two = begin + (end - begin) / 3, end - (end - begin) / 3
+        nearer = outside(one) < outside(two)
+        begin, end = np.where(nearer, begin, one), np.where(nearer, two, end)
+    return outside((begin + end) / 2)

@@ -130,7 +130,7 @@ class Judge:
             _tell(rays.name, hits, exact, wrong, leak),
         )
 
-    def _check_reported(self, frames: RayFrames, hits: Hits) -> "_Reported":
+    def _check_reported(self, frames: RayFrames, hits: Hits) -> "Reported":
         """Rule 1: each reported face by itself."""
         ray = np.flatnonzero(hits.hit)
         face = hits.face[ray]
@@ -144,7 +144,7 @@ class Judge:
             known &= self._row_of_face[face] >= 0
             corners = self.oracle.positions[self.oracle.faces[face]]
             pairs = self.oracle.judge(frames, ray, face)
-        return _compare_reported(frames, ray, hits, pairs, corners, known)
+        return compare_reported(frames, ray, hits, pairs, corners, known)
 
     def _certain_reach(
         self, rays: RaySet, frames: RayFrames, exact: OracleHits | None
@@ -186,13 +186,16 @@ class Judge:
         half_edges = 3 * row[at_edge] + (np.argmax(near[at_edge], axis=1) + 1) % 3
         corner = np.argmin(near[at_vertex], axis=1)
         places = np.searchsorted(self.surface.vertices, self.surface.faces[row[at_vertex], corner])
-        for index, fans in (
-            (at_edge, self.surface.edge_fans(half_edges)),
-            (at_vertex, self.surface.vertex_fans(places)),
+        for index, target, fans_of in (
+            (at_edge, half_edges, self.surface.edge_fans),
+            (at_vertex, places, self.surface.vertex_fans),
         ):
-            some = _frames_of(frames, candidates.ray[doubtful[index]])
-            found = judge_fans(some, self.surface, fans, self.oracle.error_bound)
-            verdict[index], reach[index] = found.certain, found.farthest
+            # All faces round a vertex ask for its fan, and hubs have a hundred thousand: judge it once a ray.
+            asked = np.stack([candidates.ray[doubtful[index]], target], axis=1)
+            asked, pair = np.unique(asked, axis=0, return_inverse=True)
+            ray, fans, pair = asked[:, 0], fans_of(asked[:, 1]), pair.reshape(-1)
+            found = judge_fans(_frames_of(frames, ray), self.surface, fans, self.oracle.error_bound)
+            verdict[index], reach[index] = found.certain[pair], found.farthest[pair]
         return verdict, reach
 
     def _matches_source(self, hits: Hits, candidates: Candidates) -> np.ndarray:
@@ -217,7 +220,7 @@ class Judge:
 
 
 @dataclass(frozen=True)
-class _Reported:
+class Reported:
     """The reported hits by themselves, (r,) each; rays that miss have no error."""
 
     valid: np.ndarray
@@ -234,9 +237,19 @@ class _Reported:
         return greatest[0], greatest[1], greatest[2], greatest[3]
 
 
-def _compare_reported(
+def compare_reported(
     frames: RayFrames, ray: np.ndarray, hits: Hits, pairs: Pairs, corners: np.ndarray, known: np.ndarray
-) -> _Reported:
+) -> Reported:
+    """Compare hits, of the rays (k,) `ray`, with what is said of the pairs that they report.
+
+    Args:
+        frames: Of all rays.
+        ray: Which rays hit.
+        hits: Of all rays.
+        pairs: (k,), of each hit's ray and face.
+        corners: (k, 3, 3) float64 of those faces.
+        known: (k,) bool, whether the face is one that may be reported at all.
+    """
     t, u, v = (column[ray].astype(np.float64) for column in (hits.t, hits.u, hits.v))
     with np.errstate(all="ignore"):
         t_error = np.abs(t - pairs.t)
@@ -250,7 +263,7 @@ def _compare_reported(
     fine = known & pairs.possible & (t > 0) & (t_ratio <= 1) & (uv_ratio <= 1)
     fine &= (u >= 0) & (v >= 0) & (u + v <= 1 + gamma(8))
     columns = (fine, pairs.t_bound, t_error, t_ratio, np.hypot(aside, along), uv_ratio)
-    return _Reported(*(_spread(column, ray, len(hits.t)) for column in columns))
+    return Reported(*(_spread(column, ray, len(hits.t)) for column in columns))
 
 
 def _spread(values: np.ndarray, ray: np.ndarray, count: int) -> np.ndarray:

@@ -205,7 +205,7 @@ def verify(
     tell("structure", 0.0)
     structure = compare_structure(placed, source, kept)
     oracle = Oracle(source, placed.error_bound)
-    surface_face = _traced_faces(placed, source, kept)
+    surface_face = traced_faces(placed, source, kept)
     surface = Surface(rounded_positions(source), source.faces[surface_face])
     tell("structure", 1.0)
     if tracer is None:
@@ -246,7 +246,7 @@ def _where_it_stands(scene: Scene, placed: Scene | Placed, source: Mesh) -> tupl
     return flat, np.flatnonzero(np.concatenate(there)).astype(np.int32)
 
 
-def _traced_faces(scene: Scene | Placed, source: Mesh, kept: np.ndarray) -> np.ndarray:
+def traced_faces(scene: Scene | Placed, source: Mesh, kept: np.ndarray) -> np.ndarray:
     """The source faces that the scene holds; all that cleaning keeps where it does not say."""
     if scene.remap is None:
         return kept

@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Int32
 
+from striptools.errors import LimitError
 from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
-from striptools.kernels.wide import fill_leaf_blocks, weigh_hits
+from striptools.kernels.weighing import weigh_hits
+from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.object_split import split_objects
 from striptools.reducem.resident import size_class
 from striptools.trace.box import MARGIN
@@ -198,6 +200,9 @@ def scale_of(scene: "Scene | Placed") -> np.float32:
     """The power of two that brings the largest coordinate to 1 to 2.
 
     Scaling by it is exact, and the model's unit no longer matters.
+
+    Raises:
+        LimitError: All coordinates are denormal.
     """
     return scale_for(_largest(scene))
 
@@ -205,7 +210,11 @@ def scale_of(scene: "Scene | Placed") -> np.float32:
 def scale_for(largest: float) -> np.float32:
     """The power of two that brings the largest coordinate to 1 to 2; 1 where it is next to nothing."""
     if largest < float(np.finfo(np.float32).tiny):
-        return np.float32(1)
+        raise LimitError(
+            f"the largest coordinate, {largest:.4g}, is less than 2**-126, which counts as zero",
+            where="scene",
+            remedy="convert the mesh in a smaller unit",
+        )
     exponent = int(np.floor(np.log2(largest)))
     return np.float32(2.0 ** -min(max(exponent, -126), 126))
 

@@ -13,6 +13,8 @@ import numpy as np
 from jax import Array, lax
 
 LOWEST = np.float32(np.finfo(np.float32).min)
+HIGHEST = np.float32(np.finfo(np.float32).max)
+LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 SIGN = np.int32(-(2**31))
 
 
@@ -24,6 +26,11 @@ def smaller(a: Array, b: Array) -> Array:
 def larger(a: Array, b: Array) -> Array:
     """The larger of two, `b` where they do not compare."""
     return jnp.where(a > b, a, b)
+
+
+def in_range(t: Array) -> Array:
+    """A positive t, no less than the least normal float32 and no more than the largest: a hit stays one."""
+    return larger(smaller(t, jnp.float32(HIGHEST)), jnp.float32(LEAST_NORMAL))
 
 
 def rounded(product: Array) -> Array:

@@ -49,6 +49,11 @@ class Tracer:
     of least t, then of least source face. A ray with a component that is not finite, or with a direction of
     zero, hits nothing.
 
+    Numbers below 2**-126 count as zero, in origins and in directions. A hit whose t, or whose unit of t (the
+    size of the scene over that of the direction), is beyond float32's normal range is told at the end of the
+    range, 2**-126 or the largest number. Origins beyond 2**40 times the largest coordinate of the scene get
+    some finite answer. Everything else is within the bound of `measure.bound`.
+
     Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
@@ -84,7 +89,8 @@ class Tracer:
     Raises:
         UsageError: There is no such device, hierarchy or residency, or not both of them together; or
             instances are to be shared of which one is too distorted for float32.
-        LimitError: All instances have more triangles than a mesh may have, or, shared, than int32 can number.
+        LimitError: All instances have more triangles than a mesh may have, or, shared, than int32 can number;
+            or the scene has no coordinate of 2**-126 or more.
     """
 
     def __init__(
@@ -229,7 +235,8 @@ class Tracer:
 
         def weigh(part: tuple[int, int]) -> None:
             mine = slice(*part)
-            self._layout.weigh(rays, at[mine], tuple(a[mine] for a in traced[:2]), found)
+            mine_traced = tuple(a[mine] if len(a) == len(at) else a for a in traced)
+            self._layout.weigh(rays, at[mine], mine_traced, found)
 
         in_chunks(weigh, len(at), self._weighers)
 

@@ -38,6 +38,7 @@ from striptools.trace.numerics import (
     BY_XLA,
     Arithmetic,
     folded,
+    in_range,
     index,
     larger,
     power_of_two_below,
@@ -654,5 +655,5 @@ def _result(
         t, name, count = best.t, best.name, best.counted
     else:
         t, name, count = best.nearest, closest_name(best, any_hit, scene), jnp.zeros(0, jnp.int32)
-    t = jnp.where(name < 0, jnp.float32(jnp.inf), t * ray.t_unit)
+    t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(t * ray.t_unit))
     return t, jnp.where(place.child != DONE, STUCK, name), count

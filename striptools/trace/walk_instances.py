@@ -44,7 +44,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import index, larger, rounded
+from striptools.trace.numerics import in_range, index, larger, rounded
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
@@ -236,7 +236,7 @@ def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOption
 
     ready, ended, best, visits = walk_alone(seen, row, options, nothing)
     hit = best.instance >= 0
-    t = jnp.where(hit, best.nearest * ready.t_unit, jnp.float32(jnp.inf))
+    t = jnp.where(hit, in_range(best.nearest * ready.t_unit), jnp.float32(jnp.inf))
     name = jnp.where(ended & ~best.stuck, best.name, STUCK)
     counters = scene.visited(visits, best.visits) if options.counting else jnp.zeros(0, jnp.int32)
     return InstancesTraced(t, name, counters, best.instance)

@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.kernels.packets import HEAD, PACKET
-from striptools.trace.numerics import folded, index, larger, smaller
+from striptools.trace.numerics import folded, in_range, index, larger, smaller
 from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
@@ -418,6 +418,6 @@ def _walk_packet(
         nodes_then_leaf,
         (state, found),
     )
-    t = jnp.where(found.name < 0, jnp.float32(jnp.inf), found.t * packet.rays[7])
+    t = jnp.where(found.name < 0, jnp.float32(jnp.inf), in_range(found.t * packet.rays[7]))
     name = jnp.where(state.place.child != DONE, STUCK, found.name)
     return state.stack, (t, name)

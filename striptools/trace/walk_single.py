@@ -13,7 +13,7 @@ from jax import Array, lax
 
 from striptools.trace.counters import KINDS, Counters
 from striptools.trace.leaf_blocks import test_block, triangles_in
-from striptools.trace.numerics import index
+from striptools.trace.numerics import in_range, index
 from striptools.trace.walk import (
     DONE,
     MISS,
@@ -75,7 +75,7 @@ def walk_each(ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> T
         ray = ready_ray(row)
         stack, ended = walk(ray, stack)
         name = closest_name(ended.best, options.any_hit)
-        t = jnp.where(name < 0, jnp.float32(jnp.inf), ended.best.nearest * ray.t_unit)
+        t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(ended.best.nearest * ray.t_unit))
         counted = jnp.stack([jnp.asarray(each, jnp.int32) for each in ended.counters])
         counted = jnp.where(is_live(ray), counted, 0) if options.counting else jnp.zeros(0, jnp.int32)
         return stack, (t, jnp.where(ended.stuck, STUCK, name), counted)
