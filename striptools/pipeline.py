@@ -18,6 +18,7 @@ from striptools.hierarchies.packed import BoxGrid, box_grid, build_top
 from striptools.mesh.clean import Cleaned, CleanOptions, clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
+from striptools.mesh.simplify import Simplified, SimplifyOptions, simplify
 from striptools.partition.boxes import face_boxes, range_boxes
 from striptools.partition.object_split import ObjectTree, split_objects
 from striptools.partition.sah import PartitionOptions
@@ -34,8 +35,8 @@ from striptools.threads import every_core
 from striptools.types import Boxes, Counts
 
 STAGES = ("load", "clean", "quantise", "partition", "order", "hierarchy", "output")
-"""The stages of a conversion, in order; `order` finds the neighbours too, range by range; a command that
-writes the scene adds `write`."""
+"""The stages of a conversion, in order, and `simplify` after `load` where it is asked; `order` finds the
+neighbours too, range by range; a command that writes the scene adds `write`."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Options:
 
     Attributes:
         clean: Welding and duplicates.
+        simplify: Fewer triangles, only where asked; instances are then flattened, attributes left out, and
+            the simplified mesh takes the place of the source: remap and `error_bound` are of it.
         precision: Every bit of float32, or a grid.
         partition: The SAH object split.
         ordering: Strips: method, cap, effort, blocks.
@@ -61,6 +64,7 @@ class Options:
     """
 
     clean: CleanOptions = field(default_factory=CleanOptions)
+    simplify: SimplifyOptions = field(default_factory=SimplifyOptions)
     precision: PrecisionOptions = field(default_factory=PrecisionOptions)
     partition: PartitionOptions = field(default_factory=PartitionOptions)
     ordering: OrderingOptions = field(default_factory=OrderingOptions)
@@ -96,6 +100,7 @@ class Report:
         largest_error: The largest distance of a vertex from the loaded one where there is a grid, else None.
         notes: What loading had to say, and what was left out.
         origin: The origin that float64 positions were given, (3,) float64, or None.
+        simplified: What simplifying did, where it was asked.
     """
 
     seconds: dict[str, float]
@@ -107,6 +112,7 @@ class Report:
     largest_error: float | None
     notes: tuple[str, ...]
     origin: np.ndarray | None = None
+    simplified: Simplified | None = None
 
 
 def convert(
@@ -158,7 +164,11 @@ def convert_with_report(
     clock = Stopwatch(watch)
     with clock.stage("load"):
         mesh = _loaded(source, file_format, options)
-        metadata = _metadata(source, mesh)
+        metadata, simplified = _metadata(source, mesh), None
+    if options.simplify.asked:
+        with clock.stage("simplify"):
+            simplified = simplify(mesh, options.simplify, threads=threads)
+            mesh, metadata["simplified"] = simplified.mesh, simplified.to_dict()
     with clock.stage("clean"):
         cleaned = clean(mesh, options.clean, threads)
         _refuse_nothing(cleaned)
@@ -215,7 +225,7 @@ def convert_with_report(
         counts |= {"geometries": len(roots.blocks) - 1, "instances": len(scene.instances)}
     seconds, peak = clock.read()
     moved = (cleaned.largest_rounding, cleaned.weld_error, exponent, largest_error)
-    return scene, Report(seconds, peak, counts, *moved, notes, cleaned.origin)
+    return scene, Report(seconds, peak, counts, *moved, notes, cleaned.origin, simplified)
 
 
 def open(source: str | Path | IO[bytes]) -> Scene:
@@ -238,7 +248,7 @@ def open(source: str | Path | IO[bytes]) -> Scene:
 
 def _loaded(source: Mesh | str | Path | IO[bytes], file_format: str | None, options: Options) -> Mesh:
     """The mesh, with instances where they are asked for and can be kept."""
-    keep = options.instances
+    keep = options.instances and not options.simplify.asked
     mesh = source if isinstance(source, Mesh) else load_mesh(source, file_format=file_format, instances=keep)
     mesh = mesh.geometry() if options.geometry_only else fitting(mesh)
     if keep and mesh.instances is not None:

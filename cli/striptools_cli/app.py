@@ -25,6 +25,8 @@ VERBS = {
     "verify": "Trace a scene file with JAX and prove it against its source mesh.",
     "render": "Draw a picture of a scene file with the same tracer.",
     "study": "Compare stripifiers or hierarchies on a mesh: memory, rays a second, quality.",
+    "trade": "Measure what bytes, speed and error are traded for each other on a mesh.",
+    "bench": "Repeat this project's figures on your models, and say what got worse.",
     "extremes": "Run extreme cases through every mode of tracing, and judge them exactly.",
     "doctor": "Print the environment, for bug reports.",
 }

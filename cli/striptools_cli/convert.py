@@ -10,6 +10,7 @@ from typing import IO, Annotated, cast, get_args
 
 import typer
 
+from striptools.choose import TARGETS, Wish, convert_to_wish
 from striptools.errors import UnreadableMeshError, UsageError
 from striptools.hierarchies.options import (
     MOST_LEVELS,
@@ -51,6 +52,7 @@ from striptools_cli.streams import (
     refuse_same,
     say,
 )
+from striptools_cli.wishes import length, said_of, simplify_options, wish_for
 
 _CLEAN = CleanOptions()
 _ORDER = OrderingOptions()
@@ -124,6 +126,49 @@ def run(
             metavar="D",
             help="The coarsest grid that moves no vertex by more than D, or Drel diagonals, like 1e-4rel.",
             show_default="keep every bit",
+        ),
+    ] = None,
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE",
+            help="The most that a tracer may keep, like 100MB: the finest precision that fits, no coarser "
+            "than --max-error.",
+            show_default="no limit",
+        ),
+    ] = None,
+    wanted: Annotated[
+        str | None,
+        typer.Option(
+            "--target",
+            metavar="NAME",
+            help=f"Choose options by what matters most: {', '.join(TARGETS)}; says which and why.",
+            show_default="none",
+        ),
+    ] = None,
+    table: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="The points.json of a trade to choose --target from.",
+            show_default="the package's",
+        ),
+    ] = None,
+    simplify: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Keep this share of the triangles, like 25% or 0.25; needs the extra simplify.",
+            show_default="all",
+        ),
+    ] = None,
+    simplify_error: Annotated[
+        str | None,
+        typer.Option(
+            metavar="D",
+            help="As few triangles as keep both surfaces within D of each other, or Drel diagonals; with "
+            "--simplify, refuse what strays farther.",
+            show_default="any",
         ),
     ] = None,
     hierarchy: Annotated[
@@ -255,12 +300,14 @@ def run(
             block or None,
             flips,
         ),
+        simplify=simplify_options(simplify, simplify_error),
         precision=_precision(bits, max_error),
         hierarchy=asked_for(hierarchy, over, levels, balance, metric),
         boxes=boxes,
         remap=not no_remap,
         threads=threads,
     )
+    wish = wish_for(budget, wanted, table, options)
     write_format = output_format(target, to_format, (SCENE_FORMAT, *WRITE_FORMATS))
     _check_names(source, target, report)
     out = Target.open(target, force=force)
@@ -268,12 +315,14 @@ def run(
     read_format = input_format(file, from_format)
     if archive and (strips or write_format != SCENE_FORMAT):
         raise UsageError("--archive compresses a scene, but OUT is none", remedy="leave it out")
+    if wish is not None and (strips or write_format != SCENE_FORMAT):
+        raise UsageError("--budget and --target are for scenes, but OUT is none", remedy="leave them out")
     if strips:
         _check_strips(read_format, write_format, options)
         job = _to_strips
     else:
         _check_direction(read_format, write_format, options)
-        job = _to_mesh if read_format == SCENE_FORMAT else partial(_to_scene, archive=archive)
+        job = _to_mesh if read_format == SCENE_FORMAT else partial(_to_scene, archive=archive, wish=wish)
     outcome = job(file, out, options, (read_format, write_format), quiet)
     if report:
         Target.open(report, force=True).write(lambda file: _write_text(file, render(outcome.facts, "json")))
@@ -328,25 +377,28 @@ def _check_names(source: str, target: str, report: str | None) -> None:
 def _precision(bits: int | None, max_error: str | None) -> PrecisionOptions:
     if max_error is None:
         return PrecisionOptions(bits)
-    relative = max_error.endswith("rel")
-    try:
-        largest = float(max_error.removesuffix("rel"))
-    except ValueError:
-        raise UsageError(
-            f"{max_error!r} is no error", where="--max-error", remedy="give a number, or one like 1e-4rel"
-        ) from None
-    return PrecisionOptions(bits, largest, relative)
+    return PrecisionOptions(bits, *length(max_error, "--max-error"))
 
 
 def _to_scene(
-    source: Source, target: Target, options: Options, formats: tuple[str, str], quiet: bool, *, archive: bool
+    source: Source,
+    target: Target,
+    options: Options,
+    formats: tuple[str, str],
+    quiet: bool,
+    *,
+    archive: bool,
+    wish: Wish | None,
 ) -> _Outcome:
     notice.before_kernels("strip_chunks", quiet=quiet)
     clock = Stopwatch()
     with StageProgress(quiet=quiet) as progress:
-        scene, report = convert_with_report(
-            source.file, options, file_format=formats[0] or None, watch=progress.watch
-        )
+        given = {"file_format": formats[0] or None, "watch": progress.watch}
+        choice = None
+        if wish is None:
+            scene, report = convert_with_report(source.file, options, **given)
+        else:
+            scene, report, choice = convert_to_wish(source.file, options, wish, **given)
         progress.watch("write", 0.0)
         with clock.stage("write"):
             target.write(partial(scene.save, archive=archive))
@@ -354,7 +406,11 @@ def _to_scene(
     total = report.seconds["total"] + written["write"]
     seconds = _ordered({**report.seconds, "write": written["write"], "total": total})
     lines = [f"{_arrow(source, target)}, {_density(scene)}", *_changes(report)]
-    facts = {
+    if choice is not None:
+        lines.append(f"  chosen: {choice.why}")
+    facts: dict[str, object] = {
+        "chosen": None if choice is None else choice.to_dict(),
+        "simplified": None if report.simplified is None else report.simplified.to_dict(),
         "seconds": seconds,
         "peak_bytes": max(peak, report.peak_bytes),
         "counts": {**report.counts, "triangles": scene.triangle_count, "vertices": scene.vertex_count},
@@ -463,6 +519,8 @@ def _density(scene: Scene) -> str:
 def _changes(report: Report) -> Iterator[str]:
     for note in report.notes:
         yield f"  loaded: {note}"
+    if report.simplified is not None:
+        yield said_of(report.simplified)
     yield from _said(report, "cleaned", _SAID_OF_COUNTS)
     if report.origin is not None:
         origin = ", ".join(f"{value:.12g}" for value in report.origin.tolist())

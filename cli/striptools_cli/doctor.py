@@ -20,6 +20,8 @@ _EXTRAS = {
     "trace": ("jax", "jaxlib", "pillow"),
     "meshlab": ("pymeshlab",),
     "plots": ("matplotlib",),
+    "simplify": ("fast-simplification",),
+    "flip": ("flip-evaluator",),
     "peers": ("embreex", "meshoptimizer", "vtk", "PyFFI"),
 }
 

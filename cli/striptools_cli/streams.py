@@ -165,6 +165,23 @@ def refuse_same(first: str, second: str) -> None:
         raise UsageError("would be read and written at once", where=first, remedy="name another file")
 
 
+def folder_for(name: str) -> Path:
+    """The folder to write to, made where it is missing; before any work, so that none is lost.
+
+    Raises:
+        UsageError: It is a file.
+        WriteError: It cannot be made.
+    """
+    path = Path(name)
+    if path.exists() and not path.is_dir():
+        raise UsageError("is no folder", where=name, remedy="name a folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WriteError(error.strerror or "cannot be made", where=name) from error
+    return path
+
+
 def _is_scene(source: Source) -> bool:
     if not isinstance(source.file, Path):
         start = source.file.read(len(MAGIC))

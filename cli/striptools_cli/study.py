@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from striptools.errors import UsageError, WriteError
 from striptools.measure.plots import plot_study, require_plots
 from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range, study_strips
 from striptools.mesh.atomic import write_atomically
@@ -21,7 +20,7 @@ from striptools.trace.device import DeviceKind
 from striptools_cli import log, notice
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
-from striptools_cli.streams import STANDARD, Source, input_format, say
+from striptools_cli.streams import STANDARD, Source, folder_for, input_format, say
 
 Subject = Literal["strips", "presorted", "slbvh", "kdtree", "loose-octree", "hierarchies"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -79,7 +78,9 @@ def run(
     `hierarchies` puts all of them into one table. Needs the extra trace, and with --out the extra plots.
     """
     log.set_up(quiet=quiet)
-    folder = None if out is None else _folder(out)
+    if out is not None:
+        require_plots()
+    folder = None if out is None else folder_for(out)
     options = StudyOptions(
         options=Options(ordering=OrderingOptions(max_length), threads=threads),
         side=side or (_QUICK if quick else {}).get("side", _DEFAULTS.side),
@@ -197,16 +198,3 @@ def _strips(row: StudyRow) -> dict[str, object]:
         "relative_cost": quality.relative_cost,
         "order_s": row.order_seconds,
     }
-
-
-def _folder(name: str) -> Path:
-    """The folder to write to, made where it is missing; before any work, so that none is lost."""
-    require_plots()
-    path = Path(name)
-    if path.exists() and not path.is_dir():
-        raise UsageError("is no folder", where=name, remedy="name a folder")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WriteError(error.strerror or "cannot be made", where=name) from error
-    return path

@@ -19,6 +19,7 @@ same program. Differences:
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -287,7 +288,11 @@ def _steps(
 
 
 def timed_in_turn(
-    tracers: dict[str, Tracer], rays: tuple[RaySet, ...], runs: int, tell: Watch
+    tracers: dict[str, Tracer],
+    rays: tuple[RaySet, ...],
+    runs: int,
+    tell: Watch,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, np.ndarray]:
     """(runs, k) seconds of each variant, for k kinds of rays; all in turn within each run."""
     times = {name: np.zeros((runs, len(rays))) for name in tracers}
@@ -300,16 +305,16 @@ def timed_in_turn(
                 # Another one begins each time, so that none always follows the same other one.
                 begin = (turn + run) % len(names)
                 for name in names[begin:] + names[:begin]:
-                    seconds = _seconds(tracers[name], part, slice(first, first + SLICE))
+                    seconds = _seconds(tracers[name], part, slice(first, first + SLICE), clock)
                     times[name][max(run, 0), kind] += seconds if run >= 0 else 0.0
     return times
 
 
-def _seconds(tracer: Tracer, rays: RaySet, part: slice) -> float:
-    start = time.perf_counter()
+def _seconds(tracer: Tracer, rays: RaySet, part: slice, clock: Callable[[], float]) -> float:
+    start = clock()
     # One by one: packets are of one walk, and hide what a hierarchy costs a ray.
     tracer.closest_hit(rays.origins[part], rays.directions[part], packets=False)
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def _qualities(scenes: dict[str, Scene], options: Options) -> dict[str, StripQuality]:

@@ -1,6 +1,5 @@
 """A scene laid out for the walk, expanded: wide nodes, leaf blocks, and the way from a face to its place."""
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.weighing import weigh_hits
 from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.object_split import split_objects
+from striptools.reducem.resident import size_class
 from striptools.trace.box import MARGIN
 from striptools.trace.counters import Counters
 from striptools.trace.layout import Found, PacketView, Rays, packet_view
@@ -227,17 +227,6 @@ def reach_of(scene: "Scene | Placed", scale: np.float32) -> np.float32:
 def _largest(scene: "Scene | Placed") -> float:
     """The largest coordinate."""
     return float(np.abs([scene.low, scene.high]).max())
-
-
-def size_class(count: int, steps: int = 4) -> int:
-    """The least of 1024, 1218, 1449, 1723, 2048, ... (`steps` to each doubling) that is at least `count`.
-
-    A program is compiled for the sizes of its arrays: scenes of the same class share it.
-    """
-    step = 10 * steps
-    while (size := math.ceil(2 ** (step / steps))) < count:
-        step += 1
-    return size
 
 
 def aligned_full(shape: tuple[int, ...], value: float) -> np.ndarray:

@@ -1,0 +1,149 @@
+"""A trade as one HTML file that opens anywhere: sentences, plots, the table, and pictures of differences.
+
+Nothing is loaded from elsewhere: pictures are in it as data, and there is no script.
+"""
+
+import base64
+import html
+from pathlib import Path
+
+from striptools.measure.trade import Point, Trade, picture_name
+from striptools.measure.trade_points import BASELINE
+
+COLUMNS = {
+    "name": "point",
+    "triangles": "triangles",
+    "memory_per_triangle": "B/tri in memory",
+    "disk_per_triangle": "B/tri on disk",
+    "build_seconds": "build s",
+    "primary_ratio": "primary rays/s",
+    "secondary_ratio": "secondary rays/s",
+    "largest_error": "largest error",
+    "rms_error": "rms error",
+    "declared_bound": "declared bound",
+    "t_largest": "t error, largest",
+    "t_rms": "t error, rms",
+    "normal_largest": "normal, largest (deg)",
+    "normal_rms": "normal, rms (deg)",
+    "wrong_per_million": "wrong per million rays",
+    "silhouette_per_million": "silhouette, pixels per million",
+    "leaks": "leaks",
+    "disagreements": "disagreements",
+    "psnr": "PSNR dB",
+    "flip": "FLIP",
+}
+"""The table's columns: fields of a point, and their headings."""
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; }
+table { border-collapse: collapse; font-size: 12px; } th, td { padding: 2px 7px; text-align: right; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child { text-align: left; }
+tr:nth-child(even) { background: #f4f5f7; } .wide { overflow-x: auto; } img { max-width: 100%; }
+figure { display: inline-block; margin: 6px; width: 290px; } figcaption { font-size: 12px; }
+.bad { color: #b00020; font-weight: bold; } footer { color: #666; font-size: 12px; margin-top: 2rem; }
+"""
+
+
+def report_html(trade: Trade, plot: bytes | None, pictures: dict[str, bytes]) -> str:
+    """The report.
+
+    Args:
+        trade: What was found.
+        plot: The Pareto plots, a PNG; None where matplotlib is not installed.
+        pictures: A PNG for each point that has one, by its name.
+    """
+    title = html.escape(f"What is traded on {trade.model}")
+    parts = [
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
+        f"<style>{_STYLE}</style></head><body><h1>{title}</h1>",
+        f"<p>{html.escape(_intro(trade))}</p>",
+        *(f"<p>{html.escape(line)}</p>" for line in sentences(trade)),
+        "" if plot is None else f'<p><img alt="Pareto plots" src="{_inline(plot)}"></p>',
+        f'<h2>Every point</h2><div class="wide">{_table(trade)}</div>',
+        "<h2>Pictures</h2><p>Each point by one camera, and beside it where it differs from the default.</p>",
+        *(_figure(point, pictures[point.name]) for point in trade.points if point.name in pictures),
+        *(f"<p>Left out: {html.escape(f'{name}: {why}')}</p>" for name, why in trade.left_out.items()),
+        f"<footer>{html.escape(trade.machine)}; {html.escape(trade.versions)}</footer></body></html>\n",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def sentences(trade: Trade) -> list[str]:
+    """What the trade is, in three sentences with its figures."""
+    of = {point.name: point for point in trade.points}
+    base, grids = of[BASELINE], [point for point in trade.points if point.factor == "precision"]
+    found = []
+    if grids:
+        safe = [p for p in grids if p.wrong_per_million <= 10] or grids[:1]
+        least = min(safe, key=lambda p: p.disk_per_triangle)
+        found.append(
+            f"Precision buys bytes on disk and costs error, not speed: {least.value} take "
+            f"{least.disk_per_triangle:.2f} bytes per triangle instead of {base.disk_per_triangle:.2f}, move "
+            f"no vertex by more than {least.declared_bound:.1e} diagonals, and send at most ten rays of a "
+            "million to another part of the surface."
+        )
+    packed = of.get("residency: compressed")
+    if packed:
+        found.append(
+            f"Residency buys memory and costs speed, not error: compressed takes "
+            f"{packed.memory_per_triangle:.1f} bytes per triangle instead of {base.memory_per_triangle:.1f}, "
+            f"at {packed.primary_ratio:.2f} of the primary and {packed.secondary_ratio:.2f} of the secondary "
+            "rays a second, with the same hits."
+        )
+    fewer = [point for point in trade.points if point.factor == "simplification"]
+    if fewer:
+        one = min(fewer, key=lambda p: abs(p.triangles / trade.triangles - 0.25))
+        found.append(
+            f"Simplification buys everything but error: {one.value} of the triangles take "
+            f"{one.memory_per_triangle:.1f} bytes per source triangle in memory, but the surface strays by "
+            f"up to {one.declared_bound:.1e} diagonals and {one.wrong_per_million:,.0f} rays of a million "
+            "end on another part of it."
+        )
+    return found
+
+
+def pictures_of(trade: Trade, folder: Path) -> dict[str, bytes]:
+    """The pictures that a trade left in its folder, by the points' names."""
+    paths = {point.name: folder / picture_name(point.name) for point in trade.points}
+    return {name: path.read_bytes() for name, path in paths.items() if path.is_file()}
+
+
+def _intro(trade: Trade) -> str:
+    return (
+        f"{trade.triangles:,} triangles, {trade.rays[0]:,} primary and {trade.rays[1]:,} secondary rays. One "
+        "factor at a time differs from the default. Lengths are in diagonals of the model, "
+        f"{trade.diagonal:.6g} units; bytes are divided by the triangles of the source; rays a second are "
+        "those of the point over those of the default, traced in turn in the same run."
+    )
+
+
+def _table(trade: Trade) -> str:
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in COLUMNS.values())
+    rows = ["".join(_cell(point, name) for name in COLUMNS) for point in trade.points]
+    return f"<table><tr>{head}</tr>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+
+
+def _cell(point: Point, name: str) -> str:
+    value = getattr(point, name)
+    bad = ' class="bad"' if name in ("leaks", "disagreements") and value else ""
+    if value is None:
+        text = "-"
+    elif isinstance(value, int):
+        text = f"{value:,}"
+    elif isinstance(value, float):
+        text = f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    else:
+        text = html.escape(str(value))
+    return f"<td{bad}>{text}</td>"
+
+
+def _figure(point: Point, picture: bytes) -> str:
+    caption = f"{point.name}: {point.psnr:.1f} dB" + (
+        "" if point.flip is None else f", FLIP {point.flip:.4f}"
+    )
+    name = html.escape(caption)
+    return f'<figure><img alt="{name}" src="{_inline(picture)}"><figcaption>{name}</figcaption></figure>'
+
+
+def _inline(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"

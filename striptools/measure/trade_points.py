@@ -1,0 +1,116 @@
+"""The points of a trade: the default, one factor at a time around it, and a few named pairs.
+
+There is one precision of stored boxes (8 bits a plane on the scene's grid, SPEC 4.4); what can be chosen is
+whether those inside blocks are stored or rebuilt, and that is the factor here and in the pair with residency.
+"""
+
+import inspect
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+from striptools.hierarchies.options import HierarchyName, HierarchyOptions
+from striptools.pipeline import Options
+from striptools.reducem.quantize import PrecisionOptions
+from striptools.trace import Tracer
+
+BASELINE = "default"
+
+BITS = (24, 22, 20, 18, 16, 14, 12, 10, 8)
+SHARES = (0.5, 0.25, 0.1, 0.05, 0.02, 0.01)
+LENGTHS = (4, 8, 16, 32, 64)
+BLOCKS = (32, 64, 128)
+
+QUICK_BITS = (20, 16, 12, 8)
+QUICK_SHARES = (0.25, 0.05)
+QUICK_LENGTHS = (8, 32)
+QUICK_BLOCKS = (64,)
+
+PAIR_BITS, PAIR_SHARES = (16, 12), (0.25, 0.05)
+
+Residency = Literal["expanded", "compressed"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point, before it is measured.
+
+    Attributes:
+        factor: What differs from the default: `default` itself, a factor, or a pair.
+        value: By how much, in words.
+        options: Of the conversion.
+        keep: The share of the triangles that simplification keeps.
+        resident: How the tracer keeps the scene.
+        test: The tracer's triangle test; None for its default one.
+    """
+
+    factor: str
+    value: str
+    options: Options
+    keep: float = 1.0
+    resident: Residency = "expanded"
+    test: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Factor and value."""
+        return self.factor if self.factor == BASELINE else f"{self.factor}: {self.value}"
+
+
+def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
+    """The points to measure, the default first.
+
+    Args:
+        base: What all have in common; its precision, hierarchy and boxes are those of the default.
+        quick: Few values of each factor.
+    """
+    bits = QUICK_BITS if quick else BITS
+    shares = QUICK_SHARES if quick else SHARES
+    found = [Setting(BASELINE, "lossless", base)]
+    found += [Setting("precision", f"{b} bits", _on_grid(base, b)) for b in bits]
+    found += [Setting("simplification", f"{share:.0%}", base, keep=share) for share in shares]
+    found += [
+        Setting("strip cap", str(length), _ordered(base, max_length=length))
+        for length in (QUICK_LENGTHS if quick else LENGTHS)
+        if length != base.ordering.max_length
+    ]
+    found += [
+        Setting("block size", str(block), _ordered(base, block=block))
+        for block in (QUICK_BLOCKS if quick else BLOCKS)
+    ]
+    found += [
+        Setting("hierarchy", name, replace(base, hierarchy=HierarchyOptions(name), boxes="rebuilt"))
+        for name in get_args(HierarchyName)
+        if name != base.hierarchy.name
+    ]
+    stored = replace(base, boxes="stored")
+    found += [
+        Setting("boxes", "stored", stored),
+        Setting("residency", "compressed", base, resident="compressed"),
+    ]
+    found += [Setting("triangle test", test, base, test=test) for test in triangle_tests()]
+    found += [
+        Setting("precision x simplification", f"{b} bits, {share:.0%}", _on_grid(base, b), keep=share)
+        for b in PAIR_BITS
+        for share in PAIR_SHARES
+        if not quick or (b, share) == (PAIR_BITS[0], PAIR_SHARES[0])
+    ]
+    found.append(Setting("residency x boxes", "compressed, stored", stored, resident="compressed"))
+    return tuple(found)
+
+
+def triangle_tests() -> tuple[str, ...]:
+    """The triangle tests that a tracer may be asked for, but for its default one."""
+    parameter = inspect.signature(Tracer).parameters.get("test")
+    return (
+        ()
+        if parameter is None
+        else tuple(t for t in get_args(parameter.annotation) if t != parameter.default)
+    )
+
+
+def _on_grid(base: Options, bits: int) -> Options:
+    return replace(base, precision=PrecisionOptions(bits))
+
+
+def _ordered(base: Options, **changes: int) -> Options:
+    return replace(base, ordering=replace(base.ordering, **changes))

@@ -1,0 +1,53 @@
+"""How many bytes a tracer keeps of a scene, counted without tracing; tests compare with the tracer's count.
+
+Expanded: 320 bytes a run, 224 a node, and 8 a face of the source. Compressed: nodes, runs, blocks and remap
+as they are in a file that stores its boxes, else in size classes.
+"""
+
+import math
+from typing import Literal
+
+from striptools.reducem.scene import Scene
+
+Residency = Literal["expanded", "compressed"]
+
+RUN_BYTES, NODE_BYTES, FACE_BYTES = 320, 224, 8
+EXPANDED_STEPS, COMPRESSED_STEPS = 4, 16
+"""Size classes to each doubling."""
+
+
+def size_class(count: int, steps: int = EXPANDED_STEPS) -> int:
+    """The least of 1024, 1218, 1449, 1723, 2048, ... (`steps` to each doubling) that is at least `count`.
+
+    A program is compiled for the sizes of its arrays: scenes of the same class share it.
+    """
+    step = 10 * steps
+    while (size := math.ceil(2 ** (step / steps))) < count:
+        step += 1
+    return size
+
+
+def resident_bytes(scene: Scene, resident: Residency) -> int | None:
+    """What a tracer keeps of a scene through its stored hierarchy; None where that is not counted here.
+
+    Args:
+        scene: Counted are scenes of the default hierarchy without instances.
+        resident: How it is kept.
+    """
+    if scene.hierarchy is not None or scene.instances is not None or scene.block_count == 0:
+        return None
+    packed = scene.with_boxes()
+    assert packed.runs is not None
+    assert packed.first_run is not None
+    if resident == "expanded":
+        faces = scene.triangle_count if scene.remap is None else int(scene.remap.face.max()) + 1
+        kept = RUN_BYTES * size_class(len(packed.runs)) + NODE_BYTES * size_class(len(packed.nodes) + 1)
+        return kept + FACE_BYTES * faces
+    arrays = [packed.nodes, scene.blocks.headers, scene.blocks.words, packed.first_run, packed.runs]
+    turns = 0
+    if scene.remap is not None:
+        arrays.append(scene.remap.face)
+        turns = scene.remap.rotation.nbytes
+    if scene.packed.runs is not None:
+        return sum(array.nbytes for array in arrays) + turns
+    return sum(array[:1].nbytes * size_class(len(array), COMPRESSED_STEPS) for array in arrays) + turns
