@@ -30,7 +30,8 @@ def larger(a: Array, b: Array) -> Array:
 
 def in_range(t: Array) -> Array:
     """A positive t, no less than the least normal float32 and no more than the largest: a hit stays one."""
-    return larger(smaller(t, HIGHEST), LEAST_NORMAL)
+    t = jnp.where(t < HIGHEST, t, HIGHEST)
+    return jnp.where(t > LEAST_NORMAL, t, LEAST_NORMAL)
 
 
 def rounded(product: Array) -> Array:
