@@ -173,10 +173,10 @@ def stream_ready(
     assert seen is not None
     begin = 0
     while begin < count:
-        buffers = packed.take()
-        places = (buffers.rows, buffers.rows.view(np.int32), buffers.at, alone, dropped)
+        rows, at = packed.room()
+        places = (rows, rows.view(np.int32), at, alone, dropped)
         live, left, begin = ready_packets(*rays, begin, seen.frame, seen.box, seen.density, *places)
-        yield from packed.send(buffers, live)
+        yield from packed.fill(live)
         if left:
             yield from _send_each(single, layout, rays, alone[:left], dropped)
     yield from packed.drain()
@@ -190,10 +190,9 @@ def _send_each(
     seen = (tuple(layout.arrays.frame), *layout.root)
     begin, count = 0, len(which) or len(rays[0])
     while begin < count:
-        buffers = pipe.take()
-        places = (buffers.rows, buffers.rows.view(np.int32), buffers.at)
-        live, begin = ready_rays(*rays, which, begin, *seen, True, *places, dropped)
-        yield from pipe.send(buffers, live)
+        rows, at = pipe.room()
+        live, begin = ready_rays(*rays, which, begin, *seen, True, rows, rows.view(np.int32), at, dropped)
+        yield from pipe.fill(live)
 
 
 class _Buffers(NamedTuple):
@@ -230,31 +229,43 @@ class _Pipe:
         room = next((size for size in sizes if size * mesh.size >= shape[0]), sizes[-1])
         self._shape = room * mesh.size, shape[1]
         self._spare: list[_Buffers] = []
+        self._filling: _Buffers | None = None
+        self._filled = 0
         self._waiting: deque[tuple[int, int, Any, _Buffers]] = deque()
 
-    def take(self) -> _Buffers:
-        """Buffers that nothing reads any more."""
-        if self._spare:
-            return self._spare.pop()
-        rows = self._shape[0]
-        return _Buffers(aligned_full(self._shape, 0.0), np.zeros((rows, *self._lanes), np.int32))
+    def room(self) -> _Buffers:
+        """The places that are not filled yet."""
+        if self._filling is None:
+            self._filling = self._spare.pop() if self._spare else self._new()
+        return _Buffers(self._filling.rows[self._filled :], self._filling.at[self._filled :])
 
-    def send(self, buffers: _Buffers, live: int) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
-        """Send the first `live` rows; yield what is done where enough is on its way."""
-        if live == 0:
-            self._spare.append(buffers)
-            return
+    def fill(self, live: int) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Take the first `live` of them as filled; send all once they are, and yield what is done."""
+        self._filled += live
+        if self._filling is not None and self._filled == len(self._filling.rows):
+            yield from self._send()
+
+    def drain(self) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        """Send what is left, and yield all that is on its way."""
+        if self._filled:
+            yield from self._send()
+        while self._waiting:
+            yield self._collect()
+
+    def _new(self) -> _Buffers:
+        rows = aligned_full(self._shape, 0.0)
+        return _Buffers(rows, np.zeros((len(rows), *self._lanes), np.int32))
+
+    def _send(self) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+        buffers, live = self._filling, self._filled
+        assert buffers is not None
+        self._filling, self._filled = None, 0
         _, per_device = next(tiles(live, self._mesh.size, self._sizes))
         with quiet_jax():
             padded = _spread(buffers.rows[:live], self._mesh.size, per_device)
             traced = self._compiled(self._scene, jax.device_put(padded, self._split))
         self._waiting.append((live, per_device, traced, buffers))
         if len(self._waiting) >= READY_IN_FLIGHT:
-            yield self._collect()
-
-    def drain(self) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
-        """Yield all that is on its way."""
-        while self._waiting:
             yield self._collect()
 
     def _collect(self) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
