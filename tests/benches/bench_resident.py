@@ -2,9 +2,10 @@
 
     python tests/benches/bench_resident.py MODEL [MODEL ...] [--repeats 21] [--record] [--note TEXT]
 
-MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, all of its picture and a run
-from the middle, and ambient occlusion from what it sees, closest hit and any hit. Times are of the processor,
-so that other work on the machine tells less; a ratio is the median of the ratios of runs next to each other.
+MODEL is a mesh or a scene file. Rays are those of `bench_trace`: a camera's, in packets and one by one, all
+of its picture and a run from the middle, and ambient occlusion from what it sees, closest hit and any hit.
+Times are of the processor, so that other work on the machine tells less; a ratio is the median of the ratios
+of runs next to each other.
 Bytes are of all arrays that a tracer keeps.
 """
 
@@ -13,6 +14,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,13 +61,14 @@ def measure(name: str, scene: Scene, repeats: int, note: str) -> list[Row]:
     camera = tiled_camera_rays(scene)
     seen = wide.closest_hit(*camera).triangle
     occlusion = middle(occlusion_rays(scene.positions[scene.faces()], camera, seen))
-    for metric, rays, call in (
-        ("camera rays, the whole picture, closest hit", camera, "closest_hit"),
-        ("camera rays, closest hit", middle(camera), "closest_hit"),
-        ("AO rays, closest hit", occlusion, "closest_hit"),
-        ("AO rays, any hit", occlusion, "any_hit"),
+    for metric, rays, call, packets in (
+        ("camera rays, the whole picture, closest hit", camera, "closest_hit", True),
+        ("camera rays one by one, the whole picture, closest hit", camera, "closest_hit", False),
+        ("camera rays one by one, closest hit", middle(camera), "closest_hit", False),
+        ("AO rays, closest hit", occlusion, "closest_hit", False),
+        ("AO rays, any hit", occlusion, "any_hit", False),
     ):
-        ours, theirs = getattr(packed, call), getattr(wide, call)
+        ours, theirs = (partial(getattr(one, call), packets=packets) for one in (packed, wide))
         rows.append(_compare(name, count, metric, rays, ours, theirs, repeats, note))
     return rows
 
