@@ -345,7 +345,7 @@ def test_shapes_have_the_same_hits(shape, levels):
 
 
 @pytest.mark.parametrize(
-    ("scale", "offset"), [(2.0**-140, 0), (2.0**-120, 1), (1e-8, 0), (1, 1e4), (2.0**120, 0), (2.0**100, 1e4)]
+    ("scale", "offset"), [(2.0**-126, 0), (2.0**-120, 1), (1e-8, 0), (1, 1e4), (2.0**120, 0), (2.0**100, 1e4)]
 )
 def test_units_and_offsets_have_the_same_hits(scale, offset):
     positions, faces = sphere(3)
