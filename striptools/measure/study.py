@@ -32,6 +32,7 @@ from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions
 from striptools.trace import Tracer
+from striptools.trace.counters import Counters
 from striptools.trace.device import DeviceKind
 from striptools.trace.rays import UP_CHOICES, Camera, camera_rays, cosine_rays
 from striptools.types import RayVectors
@@ -50,6 +51,9 @@ SLICE = 2**17
 
 LIFT = 1e-5
 """How far off the surface secondary rays start, in parts of the model's diagonal."""
+
+RAY_KINDS = ("camera", "AO", "random")
+"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +278,32 @@ def study_rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[Ray
     diagonal = float(np.linalg.norm(np.ptp(scene.positions.astype(np.float64), axis=0)))
     offset = LIFT * diagonal + 2.0**-20 * np.abs(points).max(axis=1, initial=0.0)
     return RaySet(origins, directions), RaySet(*cosine_rays(points, normals, offset=offset))
+
+
+def random_rays(scene: Scene, count: int) -> RaySet:
+    """Rays from anywhere in a scene's bounds in any direction, the same ones each time."""
+    random = np.random.default_rng(1)
+    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
+    origins = low + (high - low) * random.random((count, 3))
+    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
+
+
+def rays_of_each_kind(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[RaySet, ...]:
+    """Rays by `RAY_KINDS`; a random one to four pixels."""
+    return (*study_rays(scene, tracer, options), random_rays(scene, options.side**2 // 4))
+
+
+def ray_counters(tracer: Tracer, rays: RaySet) -> Counters:
+    """What each ray visits, tests and reads."""
+    counters = tracer.closest_hit(rays.origins, rays.directions, counters=True).counters
+    assert counters is not None
+    return counters
+
+
+def mean_counters(tracer: Tracer, rays: RaySet) -> Counters:
+    """What a ray visits, tests and reads on the average, a float each; 0 where there is no ray."""
+    counters = ray_counters(tracer, rays)
+    return Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters))
 
 
 def _steps(

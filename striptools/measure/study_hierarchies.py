@@ -22,10 +22,12 @@ from striptools.measure.hierarchy_cost import hierarchy_cost
 from striptools.measure.plots import require_plots, save_figure
 from striptools.measure.quality import full_tree_cost, in_strip_tree
 from striptools.measure.study import (
+    RAY_KINDS,
     RaySet,
     StudyOptions,
+    mean_counters,
     rate_and_ratio,
-    study_rays,
+    rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
 )
@@ -45,10 +47,7 @@ from striptools.trace.tracer import ResidentKind
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["KINDS", "HierarchiesStudy", "HierarchyRow", "RayCost", "plot", "study", "tables"]
-
-KINDS = ("camera", "AO", "random")
-"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
+__all__ = ["HierarchiesStudy", "HierarchyRow", "RayCost", "plot", "study", "tables"]
 
 WIDE, OTHER = "reducem", "other"
 
@@ -93,7 +92,7 @@ class HierarchyRow:
         file_bytes: What a scene file of it takes, remap and attributes left out; None where none holds it.
         hierarchy_bytes: Those of the hierarchy among them, or what its nodes would take.
         cost: Expected cost of a ray, over that of a full SAH tree.
-        rays: What rays cost, by `KINDS`.
+        rays: What rays cost, by `RAY_KINDS`.
         judged: Rays that the oracle judged.
         disagreements: Those with a wrong answer.
         leaks: Those that slipped through.
@@ -158,7 +157,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     scene = convert(mesh, replace(options.options, instances=False, remap=True, boxes="rebuilt"))
     threads = options.threads or every_core()
     wide = Tracer(scene, device=options.device, threads=options.threads, resident="expanded")
-    rays = (*study_rays(scene, wide, options), _random_rays(scene, options.side**2 // 4))
+    rays = rays_of_each_kind(scene, wide, options)
     run = _Run(mesh, scene, rays, wide, options, tell, full_tree_cost(scene.triangle_boxes(threads)))
     candidates = _candidates(scene, threads)
     rows = []
@@ -211,13 +210,6 @@ def _nodes_of(tree: BinaryTree) -> np.ndarray:
     return nodes
 
 
-def _random_rays(scene: Scene, count: int) -> RaySet:
-    random = np.random.default_rng(1)
-    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
-    origins = low + (high - low) * random.random((count, 3))
-    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
-
-
 class _Run:
     """What all rows are measured by."""
 
@@ -243,14 +235,12 @@ class _Run:
         seconds = time.perf_counter() - start
         options = self.options
         tracer = Tracer(scene, device=options.device, threads=options.threads, resident=candidate.resident)
-        counted = [
-            tracer.closest_hit(part.origins, part.directions, counters=True).counters for part in self.rays
-        ]
+        counted = [mean_counters(tracer, part) for part in self.rays]
         times = timed_in_turn({WIDE: self.wide, OTHER: tracer}, self.rays, options.runs, self.tell)
         costs = []
         for kind, (part, counters) in enumerate(zip(self.rays, counted, strict=True)):
             rate, lead = rate_and_ratio(len(part.origins), times[OTHER][:, kind], times[WIDE][:, kind])
-            costs.append(RayCost(rate, 1 / lead, _mean(counters, "boxes"), _mean(counters, "triangles")))
+            costs.append(RayCost(rate, 1 / lead, counters.boxes, counters.triangles))
         hits = [tracer.closest_hit(part.origins, part.directions) for part in self.rays]
         different = sum(_different(one, other) for one, other in zip(hits, self.hits, strict=True))
         report = verify(scene, self.mesh, JUDGED, tracer=tracer)
@@ -258,11 +248,6 @@ class _Run:
         cost = hierarchy_cost(scene) / self.full_cost
         judged = (report.rays, report.disagreements + report.structure.errors, report.leaks, different)
         return HierarchyRow(candidate.name, seconds, *sizes, cost, tuple(costs), *judged)
-
-
-def _mean(counters: object, name: str) -> float:
-    values = getattr(counters, name)
-    return float(values.mean(dtype=np.float64)) if len(values) else 0.0
 
 
 def _different(one: Hits, other: Hits) -> int:
@@ -285,7 +270,7 @@ def _sizes(scene: Scene, *, has_file: bool) -> tuple[int | None, int]:
 
 def tables(study: HierarchiesStudy) -> list[tuple[str, list[dict[str, object]]]]:
     """The study as one table."""
-    counts = ", ".join(f"{count:,} {kind}" for count, kind in zip(study.ray_counts, KINDS, strict=True))
+    counts = ", ".join(f"{count:,} {kind}" for count, kind in zip(study.ray_counts, RAY_KINDS, strict=True))
     title = f"{study.triangles:,} triangles, {counts} rays on {', '.join(study.devices)}"
     return [(title, [_row(study, row) for row in study.rows])]
 
@@ -299,7 +284,7 @@ def _row(study: HierarchiesStudy, row: HierarchyRow) -> dict[str, object]:
         "own_B/tri": row.hierarchy_bytes / study.triangles,
         "cost": row.cost,
     }
-    for kind, cost in zip(KINDS, row.rays, strict=True):
+    for kind, cost in zip(RAY_KINDS, row.rays, strict=True):
         found[f"{kind}_boxes"], found[f"{kind}_tris"] = cost.boxes, cost.triangles
         found[f"{kind}_Mrays/s"], found[f"{kind}_ratio"] = cost.rate / 1e6, cost.ratio
     found |= {"judged": row.judged, "wrong": row.disagreements, "leaks": row.leaks}
@@ -331,13 +316,15 @@ def plot(study: HierarchiesStudy, target: str | Path | IO[bytes], title: str = "
         (boxes, "boxes", "boxes, planes, slabs tested by a ray"),
         (triangles, "triangles", "triangles tested by a ray"),
     ):
-        _bars(axes, rows, [[getattr(r.rays[k], name) for r in rows] for k in range(len(KINDS))], _COLOURS)
+        _bars(axes, rows, [[getattr(r.rays[k], name) for r in rows] for k in range(len(RAY_KINDS))], _COLOURS)
         axes.set_title(what, fontsize=10)
-    _bars(rate, rows, [[r.rays[k].rate / 1e6 for r in rows] for k in range(len(KINDS))], _COLOURS)
+    _bars(rate, rows, [[r.rays[k].rate / 1e6 for r in rows] for k in range(len(RAY_KINDS))], _COLOURS)
     rate.set_title("million rays a second, fastest run", fontsize=10)
     _bars(build, rows, [[row.build_seconds for row in rows]], ["#1b6ca8"])
     build.set_title("build, seconds", fontsize=10)
-    rate.legend(KINDS, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False)
+    rate.legend(
+        RAY_KINDS, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False
+    )
     memory.set_yticks(range(len(rows)), [row.name for row in rows])
     memory.set_ylim(len(rows) - 0.4, -0.6)
     name = f"{title}: " if title else ""

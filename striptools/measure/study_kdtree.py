@@ -21,7 +21,14 @@ import numpy as np
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
 from striptools.measure.plots import require_plots, save_figure
-from striptools.measure.study import RaySet, StudyOptions, study_rays, tell_no_one, timed_in_turn
+from striptools.measure.study import (
+    RaySet,
+    StudyOptions,
+    ray_counters,
+    study_rays,
+    tell_no_one,
+    timed_in_turn,
+)
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert
@@ -162,8 +169,7 @@ def _tracer(scene: Scene, tree: KdTree, mailbox: int, options: StudyOptions) -> 
 
 def _count(tracer: Tracer, rays: RaySet) -> tuple[int, int]:
     """Tests of triangles and steps of all rays."""
-    counters = tracer.closest_hit(rays.origins, rays.directions, counters=True).counters
-    assert counters is not None
+    counters = ray_counters(tracer, rays)
     return int(counters.triangles.sum(dtype=np.int64)), int(counters.steps.sum(dtype=np.int64))
 
 

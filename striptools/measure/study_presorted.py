@@ -25,6 +25,7 @@ from striptools.measure.plots import require_plots, save_figure
 from striptools.measure.study import (
     RaySet,
     StudyOptions,
+    mean_counters,
     rate_and_ratio,
     study_rays,
     tell_no_one,
@@ -211,7 +212,10 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     entries = _entries(scene, options, tell)
     tracers = {str(place): entry.tracer for place, entry in enumerate(entries)}
     rays = study_rays(scene, entries[-1].tracer, options)
-    counted = [_counted(entry.tracer, rays, tell, k / len(entries)) for k, entry in enumerate(entries)]
+    counted = []
+    for entry in entries:
+        tell("compile", len(counted) / len(entries))
+        counted.append([mean_counters(entry.tracer, part) for part in rays])
     times = [*timed_in_turn(tracers, rays, options.runs, tell).values()]
     whole = times[[(entry.levels, entry.node_test) for entry in entries].index((EVERY_LEVEL, "bandwidth"))]
     rows = []
@@ -247,17 +251,6 @@ def _entries(scene: Scene, options: StudyOptions, tell: Watch) -> list[_Entry]:
 
 def _tracer(layout: Layout, options: StudyOptions) -> Tracer:
     return Tracer.of_layout(layout, device=options.device, threads=options.threads)
-
-
-def _counted(tracer: Tracer, rays: tuple[RaySet, RaySet], tell: Watch, done: float) -> list[Counters]:
-    """What rays of both kinds count, on the average."""
-    tell("compile", done)
-    found = []
-    for part in rays:
-        hits = tracer.closest_hit(part.origins, part.directions, counters=True)
-        assert hits.counters is not None
-        found.append(Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in hits.counters)))
-    return found
 
 
 def _traced(rays: RaySet, seconds: np.ndarray, of_whole: np.ndarray, counters: Counters) -> Traced:

@@ -17,10 +17,12 @@ import numpy as np
 from striptools.hierarchies.options import BalanceName, HierarchyOptions, OverName
 from striptools.hierarchies.slbvh import Slbvh, build_slbvh
 from striptools.measure.study import (
+    RAY_KINDS,
     RaySet,
     StudyOptions,
+    mean_counters,
     rate_and_ratio,
-    study_rays,
+    rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
 )
@@ -34,10 +36,7 @@ from striptools.trace import Tracer
 from striptools.trace.counters import Counters
 from striptools.trace.leaves import lay_out
 
-__all__ = ["KINDS", "RayCost", "SlbvhRow", "SlbvhStudy", "study", "tables"]
-
-KINDS = ("camera", "AO", "random")
-"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
+__all__ = ["RayCost", "SlbvhRow", "SlbvhStudy", "study", "tables"]
 
 BALANCES: tuple[BalanceName, ...] = ("sah", "morton")
 OVERS: tuple[OverName, ...] = ("triangles", "strips", "blocks")
@@ -83,7 +82,7 @@ class SlbvhRow:
         node_bytes: Bytes of all nodes, empty ones included.
         empty: The share of nodes that are empty; 0 for the wide walk, which has none.
         state_bytes: Bytes that a ray keeps to find its way.
-        rays: What rays cost, by `KINDS`.
+        rays: What rays cost, by `RAY_KINDS`.
     """
 
     balance: BalanceName | None
@@ -131,8 +130,8 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     tell("convert", 0.0)
     scene = convert(mesh, replace(options.options, instances=False))
     wide = Tracer(scene, device=options.device, threads=options.threads)
-    rays = (*study_rays(scene, wide, options), _random_rays(scene, options.side**2 // 4))
-    counted = _counted(wide, rays)
+    rays = rays_of_each_kind(scene, wide, options)
+    counted = [mean_counters(wide, part) for part in rays]
     rows = []
     for balance in BALANCES:
         for over in OVERS:
@@ -141,19 +140,12 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
             walked = replace(scene, hierarchy=slbvh)
             tracer = Tracer(walked, device=options.device, threads=options.threads)
             times = timed_in_turn({WIDE: wide, HEAP: tracer}, rays, options.runs, tell)
-            costs = _costs(rays, _counted(tracer, rays), times[HEAP], times[WIDE])
+            costs = _costs(rays, [mean_counters(tracer, part) for part in rays], times[HEAP], times[WIDE])
             rows.append(_row(slbvh, balance, seconds, costs))
             if len(rows) == 1:
                 rows.insert(0, _wide_row(scene, _costs(rays, counted, times[WIDE], times[WIDE])))
     devices = tuple(str(device) for device in wide.devices)
     return SlbvhStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
-
-
-def _random_rays(scene: Scene, count: int) -> RaySet:
-    random = np.random.default_rng(1)
-    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
-    origins = low + (high - low) * random.random((count, 3))
-    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
 
 
 def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> tuple[Slbvh, float]:
@@ -164,16 +156,6 @@ def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> 
     start = time.perf_counter()
     slbvh = build_slbvh(boxes, options, threads)
     return slbvh, time.perf_counter() - start
-
-
-def _counted(tracer: Tracer, rays: tuple[RaySet, ...]) -> list[Counters]:
-    """What rays of each kind count, on the average."""
-    found = []
-    for part in rays:
-        counters = tracer.closest_hit(part.origins, part.directions, counters=True).counters
-        assert counters is not None
-        found.append(Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters)))
-    return found
 
 
 def _costs(
@@ -209,7 +191,7 @@ def tables(study: SlbvhStudy) -> list[tuple[str, list[dict[str, object]]]]:
     parts: list[tuple[str, list[dict[str, object]]]] = [
         (title, [_hierarchy(study, row) for row in study.rows])
     ]
-    for kind, name in enumerate(KINDS):
+    for kind, name in enumerate(RAY_KINDS):
         rays = f"{study.ray_counts[kind]:,} {name} rays; ratios are to the wide walk"
         parts.append((rays, [_rays(row, row.rays[kind]) for row in study.rows]))
     return parts
