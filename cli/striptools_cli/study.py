@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from striptools.measure.plots import plot_study, require_plots
+from striptools.measure.plots import plot_study, require_plots, titled
 from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range, study_strips
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
@@ -142,8 +142,7 @@ def printed_tables(tables: Tables, form: Format, title: str) -> str:
     """Tables as text, json, csv or md, one after another; those of csv have an empty line between them."""
     if form == "json":
         return render({"tables": [{"title": name, "rows": rows} for name, rows in tables]}, "json")
-    heading = f"{title}: " if title else ""
-    parts = [render_table(rows, form, heading + name) for name, rows in tables if rows]
+    parts = [render_table(rows, form, titled(title, name)) for name, rows in tables if rows]
     return "\n".join(parts)
 
 

@@ -19,7 +19,7 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.loose_octree import LooseBvh
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.measure.hierarchy_cost import hierarchy_cost
-from striptools.measure.plots import require_plots, save_figure
+from striptools.measure.plots import LIGHT, legend_below, name_rows, require_plots, save_figure, titled
 from striptools.measure.quality import full_tree_cost, in_strip_tree
 from striptools.measure.study import (
     RAY_KINDS,
@@ -294,17 +294,7 @@ def _row(study: HierarchiesStudy, row: HierarchyRow) -> dict[str, object]:
 def plot(study: HierarchiesStudy, target: str | Path | IO[bytes], title: str = "") -> int:
     """Draw the study as a PNG picture: memory, cost, tests and rays a second.
 
-    Args:
-        study: What was found.
-        target: A path, written whole or not at all, or a binary stream.
-        title: The model's name.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        WriteError: The file could not be written.
+    Target, title, result and errors are those of `plots.plot_study`.
     """
     figure = require_plots().Figure(figsize=(14, 9), dpi=110, layout="constrained")
     memory, cost, boxes, triangles, rate, build = figure.subplots(2, 3, sharey=True).reshape(-1)
@@ -322,13 +312,9 @@ def plot(study: HierarchiesStudy, target: str | Path | IO[bytes], title: str = "
     rate.set_title("million rays a second, fastest run", fontsize=10)
     _bars(build, rows, [[row.build_seconds for row in rows]], ["#1b6ca8"])
     build.set_title("build, seconds", fontsize=10)
-    rate.legend(
-        RAY_KINDS, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False
-    )
-    memory.set_yticks(range(len(rows)), [row.name for row in rows])
-    memory.set_ylim(len(rows) - 0.4, -0.6)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}{count:,} triangles under each hierarchy")
+    legend_below(rate, columns=3, labels=RAY_KINDS)
+    name_rows(memory, [row.name for row in rows])
+    figure.suptitle(titled(title, f"{count:,} triangles under each hierarchy"))
     return save_figure(figure, target)
 
 
@@ -336,7 +322,7 @@ def _plot_memory(axes: "Axes", study: HierarchiesStudy) -> None:
     place = np.arange(len(study.rows))
     own = [row.hierarchy_bytes / study.triangles for row in study.rows]
     whole = [(row.file_bytes or 0) / study.triangles for row in study.rows]
-    axes.barh(place, whole, 0.72, color="#b9bdc4")
+    axes.barh(place, whole, 0.72, color=LIGHT)
     axes.barh(place, own, 0.72, color="#1b6ca8")
     for y, (part, total) in enumerate(zip(own, whole, strict=True)):
         text = f" {part:.3g} of {total:.3g}" if total else f" {part:.3g}, no file"

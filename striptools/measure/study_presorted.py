@@ -21,7 +21,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from striptools.hierarchies.presorted import EVERY_LEVEL, Presorted, level_limit, presort
-from striptools.measure.plots import require_plots, save_figure
+from striptools.measure.plots import LIGHT, legend_below, require_plots, save_figure, titled
 from striptools.measure.study import (
     RaySet,
     StudyOptions,
@@ -67,7 +67,7 @@ PAPER = {
 WIDE = "wide SAH"
 """The default walk's name."""
 
-_PRIMARY, _SECONDARY, _LIGHT = "#1b6ca8", "#c8553d", "#b9bdc4"
+_PRIMARY, _SECONDARY = "#1b6ca8", "#c8553d"
 
 
 @dataclass(frozen=True)
@@ -309,17 +309,7 @@ def _node_test(row: PresortedRow) -> dict[str, object]:
 def plot(study: PresortedStudy, target: str | Path | IO[bytes], title: str = "") -> int:
     """Draw a study as a PNG picture: memory, tests a ray and rays a second, by levels.
 
-    Args:
-        study: What was found.
-        target: A path, written whole or not at all, or a binary stream.
-        title: The model's name.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        WriteError: The file could not be written.
+    Target, title, result and errors are those of `plots.plot_study`.
     """
     figure = require_plots().Figure(figsize=(15, 5), dpi=110, layout="constrained")
     memory, tests, rate = figure.subplots(1, 3)
@@ -328,8 +318,7 @@ def plot(study: PresortedStudy, target: str | Path | IO[bytes], title: str = "")
     tests.set_title("boxes, slabs and triangles tested by a ray", fontsize=10)
     _plot_curves(rate, study, "rate", 1e6)
     rate.set_title("traced rays, millions a second (fastest run)", fontsize=10)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}{study.triangles:,} triangles, presorted under plain SAH levels")
+    figure.suptitle(titled(title, f"{study.triangles:,} triangles, presorted under plain SAH levels"))
     return save_figure(figure, target)
 
 
@@ -337,7 +326,7 @@ def _plot_memory(axes: "Axes", study: PresortedStudy) -> None:
     rows = [row for row in study.by_levels if row.levels in LEVELS]
     for place, sizes in enumerate(PAPER.values()):
         label = f"the paper's {len(PAPER)} scenes" if place == 0 else None
-        axes.plot(LEVELS, sizes, color=_LIGHT, linewidth=0.9, label=label)
+        axes.plot(LEVELS, sizes, color=LIGHT, linewidth=0.9, label=label)
     axes.plot(LEVELS, [level_limit(n) / 1000 for n in LEVELS], color="#222222", linestyle=":", label="limit")
     axes.plot(LEVELS, [row.node_bytes / 1000 for row in rows], color=_PRIMARY, marker="o", label="this model")
     whole = study.both_tests(EVERY_LEVEL)[0]
@@ -366,7 +355,7 @@ def _plot_curves(axes: "Axes", study: PresortedStudy, what: str, unit: float) ->
 
 def _finish(axes: "Axes") -> None:
     axes.set_xlabel("plain levels", fontsize=9)
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+    legend_below(axes, columns=2, drop=0.12)
 
 
 # Notes. Rays a second over those of the whole SAH BVH in the same walk, primary/secondary, by plain levels,
