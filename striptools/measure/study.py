@@ -34,6 +34,7 @@ from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions
 from striptools.trace import Tracer
 from striptools.trace.counters import Counters
 from striptools.trace.device import DeviceKind
+from striptools.trace.layout import Layout
 from striptools.trace.rays import UP_CHOICES, Camera, camera_rays, cosine_rays
 from striptools.types import RayVectors
 
@@ -304,6 +305,12 @@ def mean_counters(tracer: Tracer, rays: RaySet) -> Counters:
     """What a ray visits, tests and reads on the average, a float each; 0 where there is no ray."""
     counters = ray_counters(tracer, rays)
     return Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters))
+
+
+def wide_bytes(layout: Layout) -> int:
+    """Bytes of the wide nodes of a layout that are in use."""
+    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
+    return int(used.sum()) * layout.arrays.nodes[0].nbytes
 
 
 def _steps(

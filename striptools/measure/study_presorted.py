@@ -30,6 +30,7 @@ from striptools.measure.study import (
     study_rays,
     tell_no_one,
     timed_in_turn,
+    wide_bytes,
 )
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import convert
@@ -244,9 +245,7 @@ def _entries(scene: Scene, options: StudyOptions, tell: Watch) -> list[_Entry]:
             size, trees = presorted.nodes.nbytes, len(presorted.starts) - 1
             entries.append(_Entry(levels, node_test, size, trees, _tracer(layout, options)))
     layout = lay_out_rebuilt(scene, threads)
-    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
-    size = int(used.sum()) * layout.arrays.nodes[0].nbytes
-    return [*entries, _Entry(None, None, size, 0, _tracer(layout, options))]
+    return [*entries, _Entry(None, None, wide_bytes(layout), 0, _tracer(layout, options))]
 
 
 def _tracer(layout: Layout, options: StudyOptions) -> Tracer:

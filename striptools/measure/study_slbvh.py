@@ -25,6 +25,7 @@ from striptools.measure.study import (
     rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
+    wide_bytes,
 )
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
@@ -179,8 +180,7 @@ def _row(slbvh: Slbvh, balance: BalanceName, seconds: float, costs: tuple[RayCos
 def _wide_row(scene: Scene, costs: tuple[RayCost, ...]) -> SlbvhRow:
     """The default walk; its nodes are laid out from the scene's own, so that there is no build to time."""
     layout = lay_out(scene)
-    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
-    size = int(used.sum()) * layout.arrays.nodes[0].nbytes
+    size = wide_bytes(layout)
     stack = ENTRY_BYTES * (layout.depth + 2)
     return SlbvhRow(None, "triangles", scene.triangle_count, layout.depth, None, size, 0.0, stack, costs)
 
