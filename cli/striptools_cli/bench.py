@@ -12,6 +12,7 @@ from striptools.measure.bench import QUICK, BenchOptions, append, bench, got_wor
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools_cli import log, notice
+from striptools_cli.options import format_option, quiet_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import say
@@ -35,8 +36,8 @@ def run(
         typer.Option(metavar="FILE", help="The file that figures are compared with and added to."),
     ] = "bench.csv",
     quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs.")] = False,
-    form: Annotated[Format, typer.Option("--format", help="How to print the figures.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and figures.")] = False,
+    form: Annotated[Format, format_option("the figures")] = "text",
+    quiet: Annotated[bool, quiet_option("errors and figures")] = False,
 ) -> None:
     """Measure bytes, seconds, rays a second and verification, and say what got worse on this machine.
 
