@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
 
 import striptools
@@ -161,7 +161,7 @@ def test_rays_that_are_none_and_rays_that_go_elsewhere():
 
 def test_incoherent_rays_go_alone():
     scene = scene_of(Mesh(*sphere(3)))
-    rays = aimed_rays(scene.positions, scene.faces(), 3000, 8)
+    rays = rays_at(scene, 3000, 8)
     assert_same(scene, (*rays, None), "expanded")
     assert packets_of(scene, *rays)[0] < 10
 
