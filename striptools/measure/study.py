@@ -21,6 +21,7 @@ same program. Differences:
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -178,6 +179,32 @@ class RaySet:
 
     origins: RayVectors
     directions: RayVectors
+
+
+Row = TypeVar("Row")
+
+
+@dataclass(frozen=True)
+class KindsStudy(Generic[Row]):
+    """What a study with rays of each kind found.
+
+    Attributes:
+        triangles: Triangles of the scene.
+        ray_counts: Rays in a run, by `RAY_KINDS`.
+        devices: What it was traced on.
+        rows: A row a hierarchy.
+    """
+
+    triangles: int
+    ray_counts: tuple[int, ...]
+    devices: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, tracer: Tracer, rays: tuple[RaySet, ...], rows: list[Row]) -> "KindsStudy[Row]":
+        """The study of a scene, traced with these rays on the devices of a tracer."""
+        devices = tuple(str(device) for device in tracer.devices)
+        return cls(scene.triangle_count, tuple(len(part.origins) for part in rays), devices, tuple(rows))
 
 
 def variants(ordering: OrderingOptions) -> dict[str, OrderingOptions]:
@@ -398,6 +425,23 @@ def rate_and_ratio(rays: int, seconds: np.ndarray, of_reference: np.ndarray) -> 
     if rays == 0:
         return 0.0, 1.0
     return rays / float(seconds.min()), float(np.median(seconds / of_reference))
+
+
+def rates_and_ratios(
+    rays: tuple[RaySet, ...], seconds: np.ndarray, of_reference: np.ndarray
+) -> list[tuple[float, float]]:
+    """Of each kind of rays: rays a second in the fastest run, and this rate over the reference's.
+
+    Args:
+        rays: Of k kinds.
+        seconds: (runs, k).
+        of_reference: The same of the reference.
+    """
+    found = []
+    for kind, part in enumerate(rays):
+        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_reference[:, kind])
+        found.append((rate, 1 / lead))
+    return found
 
 
 def tell_no_one(_stage: str, _fraction: float) -> None:

@@ -23,10 +23,11 @@ from striptools.measure.plots import LIGHT, legend_below, name_rows, require_plo
 from striptools.measure.quality import full_tree_cost, in_strip_tree
 from striptools.measure.study import (
     RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
     mean_counters,
-    rate_and_ratio,
+    rates_and_ratios,
     rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
@@ -111,21 +112,8 @@ class HierarchyRow:
     different: int
 
 
-@dataclass(frozen=True)
-class HierarchiesStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind.
-        devices: What it was traced on.
-        rows: The default hierarchy first.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[HierarchyRow, ...]
+HierarchiesStudy = KindsStudy[HierarchyRow]
+"""What the study found: a row of the default hierarchy first."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +152,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     for done, candidate in enumerate(candidates):
         tell("build", done / len(candidates))
         rows.append(run.row(candidate))
-    devices = tuple(str(device) for device in wide.devices)
-    return HierarchiesStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
+    return HierarchiesStudy.of(scene, wide, rays, rows)
 
 
 def _candidates(scene: Scene, threads: int) -> list[_Candidate]:
@@ -237,10 +224,8 @@ class _Run:
         tracer = Tracer(scene, device=options.device, threads=options.threads, resident=candidate.resident)
         counted = [mean_counters(tracer, part) for part in self.rays]
         times = timed_in_turn({WIDE: self.wide, OTHER: tracer}, self.rays, options.runs, self.tell)
-        costs = []
-        for kind, (part, counters) in enumerate(zip(self.rays, counted, strict=True)):
-            rate, lead = rate_and_ratio(len(part.origins), times[OTHER][:, kind], times[WIDE][:, kind])
-            costs.append(RayCost(rate, 1 / lead, counters.boxes, counters.triangles))
+        rates = rates_and_ratios(self.rays, times[OTHER], times[WIDE])
+        costs = [RayCost(*rate, k.boxes, k.triangles) for rate, k in zip(rates, counted, strict=True)]
         hits = [tracer.closest_hit(part.origins, part.directions) for part in self.rays]
         different = sum(_different(one, other) for one, other in zip(hits, self.hits, strict=True))
         report = verify(scene, self.mesh, JUDGED, tracer=tracer)

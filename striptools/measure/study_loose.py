@@ -31,10 +31,11 @@ from striptools.hierarchies.strip_bvh import StripHierarchy
 from striptools.measure.quality import full_tree_cost
 from striptools.measure.study import (
     RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
     mean_counters,
-    rate_and_ratio,
+    rates_and_ratios,
     rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
@@ -103,21 +104,8 @@ class LooseRow:
     rays: tuple[RayCost, ...]
 
 
-@dataclass(frozen=True)
-class LooseStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind in a run.
-        devices: What it was traced on.
-        rows: For triangles, then for strips, a row of each build.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[LooseRow, ...]
+LooseStudy = KindsStudy[LooseRow]
+"""What the study found: for triangles, then for strips, a row of each build."""
 
 
 def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | None = None) -> LooseStudy:
@@ -157,8 +145,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         key, reference = f"{name}, {over}", f"{SAH}, {over}"
         costs = _costs(rays, counted[key], times[key], times[reference])
         rows.append(_row(name, over, part, built[SAH, over], full_cost, costs))
-    devices = tuple(str(device) for device in first.devices)
-    return LooseStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
+    return LooseStudy.of(scene, first, rays, rows)
 
 
 @dataclass(frozen=True)
@@ -215,11 +202,10 @@ def _cost_of(hierarchy: LooseBvh, starts: Counts, triangle_boxes: Boxes) -> floa
 def _costs(
     rays: tuple[RaySet, ...], counted: list[Counters], seconds: np.ndarray, of_sah: np.ndarray
 ) -> tuple[RayCost, ...]:
-    costs = []
-    for kind, (part, counters) in enumerate(zip(rays, counted, strict=True)):
-        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_sah[:, kind])
-        costs.append(RayCost(rate, 1 / lead, counters.boxes + counters.triangles, counters.triangles))
-    return tuple(costs)
+    return tuple(
+        RayCost(*rates, each.boxes + each.triangles, each.triangles)
+        for rates, each in zip(rates_and_ratios(rays, seconds, of_sah), counted, strict=True)
+    )
 
 
 def _row(

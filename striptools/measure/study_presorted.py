@@ -23,10 +23,9 @@ import numpy as np
 from striptools.hierarchies.presorted import EVERY_LEVEL, Presorted, level_limit, presort
 from striptools.measure.plots import LIGHT, legend_below, require_plots, save_figure, titled
 from striptools.measure.study import (
-    RaySet,
     StudyOptions,
     mean_counters,
-    rate_and_ratio,
+    rates_and_ratios,
     study_rays,
     tell_no_one,
     timed_in_turn,
@@ -221,9 +220,8 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     whole = times[[(entry.levels, entry.node_test) for entry in entries].index((EVERY_LEVEL, "bandwidth"))]
     rows = []
     for entry, seconds, counters in zip(entries, times, counted, strict=True):
-        primary, secondary = (
-            _traced(rays[kind], seconds[:, kind], whole[:, kind], counters[kind]) for kind in range(2)
-        )
+        rates = rates_and_ratios(rays, seconds, whole)
+        primary, secondary = (Traced(*rate, *_costs(k)) for rate, k in zip(rates, counters, strict=True))
         facts = (entry.levels, entry.node_test, entry.node_bytes, entry.trees)
         rows.append(PresortedRow(*facts, primary, secondary))
     counts = [len(part.origins) for part in rays]
@@ -252,10 +250,8 @@ def _tracer(layout: Layout, options: StudyOptions) -> Tracer:
     return Tracer.of_layout(layout, device=options.device, threads=options.threads)
 
 
-def _traced(rays: RaySet, seconds: np.ndarray, of_whole: np.ndarray, counters: Counters) -> Traced:
-    rate, lead = rate_and_ratio(len(rays.origins), seconds, of_whole)
-    costs = (counters.boxes, counters.triangles, counters.node_bytes, counters.geometry_bytes)
-    return Traced(rate, 1 / lead, *costs)
+def _costs(counters: Counters) -> tuple[float, float, float, float]:
+    return counters.boxes, counters.triangles, counters.node_bytes, counters.geometry_bytes
 
 
 def tables(study: PresortedStudy) -> list[tuple[str, list[dict[str, object]]]]:

@@ -18,10 +18,11 @@ from striptools.hierarchies.options import BalanceName, HierarchyOptions, OverNa
 from striptools.hierarchies.slbvh import Slbvh, build_slbvh
 from striptools.measure.study import (
     RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
     mean_counters,
-    rate_and_ratio,
+    rates_and_ratios,
     rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
@@ -97,21 +98,8 @@ class SlbvhRow:
     rays: tuple[RayCost, ...]
 
 
-@dataclass(frozen=True)
-class SlbvhStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind in a run.
-        devices: What it was traced on.
-        rows: The wide walk, then balance by balance.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[SlbvhRow, ...]
+SlbvhStudy = KindsStudy[SlbvhRow]
+"""What the study found: a row of the wide walk, then balance by balance."""
 
 
 def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | None = None) -> SlbvhStudy:
@@ -145,8 +133,7 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
             rows.append(_row(slbvh, balance, seconds, costs))
             if len(rows) == 1:
                 rows.insert(0, _wide_row(scene, _costs(rays, counted, times[WIDE], times[WIDE])))
-    devices = tuple(str(device) for device in wide.devices)
-    return SlbvhStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
+    return SlbvhStudy.of(scene, wide, rays, rows)
 
 
 def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> tuple[Slbvh, float]:
@@ -162,12 +149,10 @@ def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> 
 def _costs(
     rays: tuple[RaySet, ...], counted: list[Counters], seconds: np.ndarray, of_wide: np.ndarray
 ) -> tuple[RayCost, ...]:
-    costs = []
-    for kind, (part, counters) in enumerate(zip(rays, counted, strict=True)):
-        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_wide[:, kind])
-        read = counters.node_bytes + counters.geometry_bytes
-        costs.append(RayCost(rate, 1 / lead, counters.boxes, counters.triangles, read))
-    return tuple(costs)
+    return tuple(
+        RayCost(*rates, each.boxes, each.triangles, each.node_bytes + each.geometry_bytes)
+        for rates, each in zip(rates_and_ratios(rays, seconds, of_wide), counted, strict=True)
+    )
 
 
 def _row(slbvh: Slbvh, balance: BalanceName, seconds: float, costs: tuple[RayCost, ...]) -> SlbvhRow:
