@@ -11,7 +11,7 @@ from rays import rays_at
 from scenes import scene_of, scenes, small_scene
 from shapes import COMMON
 from strategies import cube, grid, line, sphere, tangle
-from test_hoisting import loops_outside_hoisted_calls
+from test_hoisting import assert_hoisted
 from test_trace import clean, far_fetched
 
 from striptools.errors import StriptoolsError
@@ -146,9 +146,7 @@ def test_the_walk_is_hoisted(any_hit, counting):
     tracer = Tracer(under(small_scene(), leaf_size=1), device="cpu")
     options = tracer._options(any_hit=any_hit, counting=counting)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
-    text = program(tracer._mesh, options).lower(tracer._scene, rays).compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(program(tracer._mesh, options).lower(tracer._scene, rays))
 
 
 def test_a_walk_in_circles_ends(ball):

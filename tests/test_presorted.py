@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import re
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from rays import axial_rays, far_rays, rays_at, rays_from_inside
 from shapes import SHAPES, THIN, UNITS, moved_sphere
 from strategies import clean_meshes, cube, sphere, stack
-from test_hoisting import loops_outside_hoisted_calls
+from test_hoisting import assert_hoisted
 
 import striptools
 from striptools.errors import LimitError, StriptoolsError, UnreadableSceneError, UsageError
@@ -402,10 +401,7 @@ def test_walks_are_hoisted(ball, node_test, any_hit, count):
     tracer = tracer_of(ball, 3, node_test)
     given_options = tracer._options(any_hit=any_hit, counting=count)
     lowered = program(tracer._mesh, given_options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
-    text = lowered.compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(lowered, loops=3)
 
 
 def test_nodes_that_go_round_end(ball):

@@ -1,6 +1,5 @@
 """Packed blocks traced as they lie: the hits of the expanded walk, bit for bit, wherever rays come from."""
 
-import re
 from mmap import mmap
 
 import jax.numpy as jnp
@@ -249,15 +248,12 @@ def test_a_tree_that_goes_round_ends(ball):
 @pytest.mark.parametrize(("any_hit", "steps"), [(False, False), (True, False), (False, True)])
 @pytest.mark.parametrize("remap", [True, False])
 def test_walks_are_hoisted(any_hit, steps, remap):
-    from test_hoisting import loops_outside_hoisted_calls
+    from test_hoisting import assert_hoisted
 
     tracer = both(scene_of(Mesh(*sphere(3)), remap=remap))[1]
     options = tracer._options(any_hit=any_hit, counting=steps)
     lowered = program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
-    text = lowered.compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(lowered, loops=3)
 
 
 def mapping_below(array):
