@@ -26,6 +26,7 @@ and the triangle test needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, 
 would be denormal counts as zero: its planes move by less than 2^-100.
 """
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -176,7 +177,7 @@ class PackedScene(NamedTuple):
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a run, decoded, their corners along these axes."""
-        x, y, z, filled, name = self._decoded(child, decode)
+        x, y, z, filled, name = self._decoded(child, decode, self._whole_row)
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
 
@@ -186,20 +187,20 @@ class PackedScene(NamedTuple):
         nothing = ([shape] * 3,) * 3
         x, y, z, filled, name = lax.cond(
             child < 0,
-            lambda: self._decoded(child, decode),
+            lambda: self._decoded(child, decode, self._once),
             lambda: (*nothing, jnp.zeros(LANES, jnp.bool_), jnp.zeros(LANES, jnp.int32)),
         )
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
 
     def _decoded(
-        self, child: Array, decode: Decode | None
+        self, child: Array, decode: Decode | None, header_at: Callable[[Array, Array], Any]
     ) -> tuple[list[Array], list[Array], list[Array], Array, Array]:
         """Coordinates x, y, z of corners a, b, c, which lanes hold a triangle, and their names."""
         assert decode is not None
         # Behind barriers, or XLA finds the run anew for every use of it.
         block, run = self._settled(self._run_of(child))
-        header = self._settled(self._row(self.headers, block, 0, 8))
+        header = self._settled(header_at(self.headers, block))
         lane = self._lanes()
         corners = self._corners(header, run, decode.flips)
         x, y, z = self._positions(header, corners, decode)
@@ -259,6 +260,10 @@ class PackedScene(NamedTuple):
         """Some values of a row, one after the other."""
         return lax.dynamic_slice(rows, (row, jnp.uint32(first)), (1, count))[0]
 
+    def _whole_row(self, rows: Array, row: Array) -> Any:
+        """All values of a row of eight."""
+        return self._row(rows, row, 0, 8)
+
     def _planes_of(self, node: Array) -> Any:
         """(6, 8) int32: the lanes' planes on each axis, low and high."""
         planes = lax.dynamic_slice(self.planes, (node, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
@@ -272,6 +277,19 @@ class PackedScene(NamedTuple):
         inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
         rows = lax.gather(self.words, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
         return [rows[k] for k in range(count)]
+
+    def _once(self, values: Array, place: Array) -> Any:
+        """The value at a place, or the row, found once: of a pair of places XLA keeps what it gathers.
+
+        What leads to a slice it computes again for each use.
+        """
+        dimensions = lax.GatherDimensionNumbers(
+            offset_dims=tuple(range(1, values.ndim)), collapsed_slice_dims=(0,), start_index_map=(0,)
+        )
+        # Signed: XLA's CPU backend gathers wrongly by unsigned places where it does not fuse.
+        places = jnp.stack([place, place])[:, None].astype(jnp.int32)
+        inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+        return lax.gather(values, places, dimensions, slice_sizes=(1, *values.shape[1:]), mode=inside)[0]
 
     def _settled(self, values: Any) -> Any:
         """Values that are not computed again for each use."""
@@ -299,7 +317,7 @@ class PackedScene(NamedTuple):
         second = _used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
         rank = self._ones(first | second >> 1) - self._ones(inner & below)
         block = head[1] & BLOCK_BITS
-        return block, self._at(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
+        return block, self._once(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
 
     def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""

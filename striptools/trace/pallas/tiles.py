@@ -175,6 +175,9 @@ class PackedTile(PackedScene):
     def _words_at(self, places: Array, count: int) -> list[Array]:
         return [self._at(self.words, places + k) for k in range(count)]
 
+    def _once(self, values: Any, place: Any) -> Any:
+        return self._at(values, place)
+
     def _settled(self, values: Any) -> Any:
         return jax.tree.map(self.arithmetic.settled, values)
 
