@@ -131,31 +131,34 @@ class PackedScene(NamedTuple):
 
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes, scaled and rounded; not a number where there is none."""
-        head = self._head(node)
         planes = [self._planes(node, row, jnp.uint32(0), LANES) for row in rows]
-        sides = [self._side(head, row, each) for row, each in zip(rows, planes, strict=True)]
+        sides = self._sides(node, rows, planes)
         sides[0] = jnp.where(planes[0] <= planes[1], sides[0], jnp.float32(jnp.nan))
         return sides
 
     def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
         """Sides of the box in one lane."""
-        head = self._head(node)
-        return [self._side(head, row, self._planes(node, row, lane, 1)[0]) for row in rows]
-
-    def _head(self, node: Array) -> Array:
-        return lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(0)), (1, 4))[0]
+        return self._sides(node, rows, [self._planes(node, row, lane, 1)[0] for row in rows])
 
     def _planes(self, node: Array, row: Array, lane: Array, count: int) -> Array:
         at = (index(node), jnp.uint32(16) + LANES * row + lane)
         return lax.dynamic_slice(self.planes, at, (1, count))[0].astype(jnp.int32)
 
-    def _side(self, head: Array, row: Array, planes: Array) -> Array:
-        """Where planes in one of the six rows lie, scaled."""
-        axis = jnp.where(row >= 3, row - 3, row)
-        origin = pick((head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF), axis).astype(jnp.int32)
-        shift = pick((head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28), axis).astype(jnp.int32)
-        cells = (origin + (planes << shift)).astype(jnp.float32)
-        return cells * pick(self.frame.unit, axis) + pick(self.frame.low, axis)
+    def _sides(self, node: Array, rows: tuple[Array, ...], planes: list[Array]) -> list[Array]:
+        """Where planes in rows lie, two of an axis at a time, scaled."""
+        sides = []
+        for k in range(0, len(rows), 2):
+            axis = jnp.where(rows[k] >= 3, rows[k] - 3, rows[k])
+            # Bytes of the record: an origin has two, shifts are four bits of the fourth and the last.
+            below, above, shift = (
+                lax.dynamic_slice(self.planes, (index(node), at), (1, 1))[0, 0].astype(jnp.int32)
+                for at in (8 + 2 * axis, 9 + 2 * axis, jnp.where(axis == 0, jnp.uint32(3), jnp.uint32(15)))
+            )
+            origin, shift = below | above << 8, jnp.where(axis == 1, shift & 15, shift >> 4)
+            unit, low = (lax.dynamic_slice(a, (axis,), (1,))[0] for a in (self.frame.unit, self.frame.low))
+            for each in planes[k : k + 2]:
+                sides.append((origin + (each << shift)).astype(jnp.float32) * unit + low)
+        return sides
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk packets made ready."""
