@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from striptools.trace.triangle import Corners, Shear
+from striptools.trace.triangle_tests import TriangleTest
 from striptools.trace.walk import NO_NAME, WIDTH, Best, Leaf, replaced
 
 
-def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
+def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: TriangleTest) -> Best:
     """Test the triangles of a block, each lane against its own closest hit.
 
     Args:
@@ -19,9 +20,10 @@ def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
         block: () uint32, which of them.
         shear: Of the ray.
         best: What was found so far.
+        test: Of triangles.
     """
     leaf = leaf_in(blocks, block, shear.axes)
-    t = leaf.crossings(shear)
+    t = leaf.crossings(shear, test=test)
     closer = (t > 0) & ((t < best.t) | ((t == best.t) & (leaf.name < best.name)))
     return replaced(best, closer, t, leaf.name)
 

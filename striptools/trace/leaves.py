@@ -45,6 +45,11 @@ class LeafBlocks:
     triangle_of: Int32[np.ndarray, " f"]
     scale: np.float32
 
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`."""
+        slot = self.place[names]
+        return self.blocks[slot >> 5, :9, (slot >> 2) & 7].reshape(-1, 3, 3), slot & 3
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         given = (at, traced[0], traced[1], self.place, self.blocks, self.scale, self.triangle_of)
@@ -74,6 +79,10 @@ class ExpandedLayout:
         """Bytes of all arrays."""
         kept = _arrays_in(self.arrays)
         return sum(a.nbytes for a in kept) + self.leaves.place.nbytes + self.leaves.triangle_of.nbytes
+
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`."""
+        return self.leaves.corners_of(names)
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of its leaves are turned."""

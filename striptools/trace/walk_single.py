@@ -110,7 +110,7 @@ def test_leaf(leaves: Leaves, leaf: Array, ray: ReadyRay, best: Best) -> Best:
 
     def test(carried: tuple[Array, Best]) -> tuple[Array, Best]:
         block, best = carried
-        return block + 1, test_block(leaves.blocks, index(block), ray.shear, best)
+        return block + 1, test_block(leaves.blocks, index(block), ray.shear, best, "watertight")
 
     return lax.while_loop(lambda carried: carried[0] < end, test, (first, best))[1]
 

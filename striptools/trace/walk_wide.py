@@ -59,7 +59,7 @@ class WideScene(NamedTuple):
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
-        return test_block(self.blocks, index(-(child + 1)), shear, best)
+        return test_block(self.blocks, index(-(child + 1)), shear, best, options.test)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
