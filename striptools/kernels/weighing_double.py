@@ -9,6 +9,25 @@ from striptools.kernels.wide import first_corner, flushed
 
 
 @kernel
+def block_corners(names, place, blocks, corners, turns):
+    """Gather triangles of leaf blocks: `blocks` and `place` as `kernels.wide.fill_leaf_blocks` writes them.
+
+    Args:
+        names: (k,) int32, faces.
+        place: (f,) int32.
+        blocks: (l, 10, 8) float32.
+        corners: (k, 3, 3) float32, written: a row an axis, a column a corner, in the order of the tests.
+        turns: (k,) int32, written: corner j is the reported face's (j + turn) % 3.
+    """
+    for k in range(len(names)):
+        slot = np.int64(place[names[k]])
+        turns[k] = slot & 3
+        for axis in range(3):
+            for j in range(3):
+                corners[k, axis, j] = blocks[slot >> 5, 3 * axis + j, (slot >> 2) & 7]
+
+
+@kernel
 def packed_corners(names, headers, words, rotations, scale_exponent, corners, turns):
     """Decode triangles of packed blocks.
 

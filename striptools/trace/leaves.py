@@ -12,6 +12,7 @@ from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.weighing import weigh_hits
+from striptools.kernels.weighing_double import block_corners
 from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.object_split import split_objects
 from striptools.reducem.resident import size_class
@@ -47,8 +48,9 @@ class LeafBlocks:
 
     def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `layout.Layout`."""
-        slot = self.place[names]
-        return self.blocks[slot >> 5, :9, (slot >> 2) & 7].reshape(-1, 3, 3), slot & 3
+        corners, turns = np.zeros((len(names), 3, 3), np.float32), np.zeros(len(names), np.int32)
+        block_corners(names, self.place, self.blocks, corners, turns)
+        return corners, turns
 
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""

@@ -30,7 +30,7 @@ from striptools.trace.walk_gather import GatherKind
 from striptools.trace.walk_packed import PackedScene
 from striptools.trace.walk_points import PointOptions
 from striptools.trace.walk_wide import WideScene
-from striptools.trace.weighing import weigh_in_double
+from striptools.trace.weighing import weigh_in_double, weights_inside
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
@@ -251,7 +251,9 @@ class Tracer:
     def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`, weights by the precision of the test."""
         self._layout.weigh(rays, at, traced, found)
-        if self._test != "watertight":
+        if self._test == "fast":
+            weights_inside(at, found)
+        elif self._test != "watertight":
             weigh_in_double(self._layout, rays, at, traced[1], found)
 
     def _stream(
