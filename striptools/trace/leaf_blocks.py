@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from striptools.trace.triangle import Corners, Shear
-from striptools.trace.triangle_tests import TriangleTest
 from striptools.trace.walk import NO_NAME, WIDTH, Best, Leaf, replaced
+from striptools.types import TriangleTest
 
 
 def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: TriangleTest) -> Best:

@@ -24,13 +24,13 @@ from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
-from striptools.trace.triangle_tests import TriangleTest
 from striptools.trace.walk import MISS, WalkOptions
 from striptools.trace.walk_gather import GatherKind
 from striptools.trace.walk_packed import PackedScene
 from striptools.trace.walk_points import PointOptions
 from striptools.trace.walk_wide import WideScene
 from striptools.trace.weighing import weigh_in_double, weights_inside
+from striptools.types import TriangleTest
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene

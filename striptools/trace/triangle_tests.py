@@ -28,7 +28,7 @@ bit of the one, and makes the other no worse. TwoSum has no product. XLA does no
 `measure.arithmetic` probes.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,9 +46,7 @@ from striptools.trace.numerics import (
     with_sign_of,
 )
 from striptools.trace.triangle import Corners, Edges, Shear, crossing_of, edges_of, sheared
-
-TriangleTest = Literal["watertight", "fast", "exact-sign", "float64"]
-"""See the head of this module."""
+from striptools.types import TriangleTest
 
 Triangles = tuple[Corners, Corners, Corners]
 """Coordinates x, y, z of corners a, b, c, along the axes of a shear."""

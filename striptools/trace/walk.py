@@ -46,8 +46,9 @@ from striptools.trace.numerics import (
     smaller,
 )
 from striptools.trace.triangle import Corners, Shear, pick, shear_of
-from striptools.trace.triangle_tests import TriangleTest, crossings_by, wants_way
+from striptools.trace.triangle_tests import crossings_by, wants_way
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
+from striptools.types import TriangleTest
 
 WIDTH = 8
 FLOATS = 17
