@@ -346,7 +346,7 @@ class _FastNumbers:
 def _volume(
     a: tuple[np.ndarray, float], b: tuple[np.ndarray, float], c: tuple[np.ndarray, float], roundings: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The volume a . (b x c) of vectors (k, 3) that may each be moved on each axis, and by how much it may be off."""
+    """The volume a . (b x c) of vectors (k, 3), each moved on each axis by so much, and how far it is off."""
 
     def sizes(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
         one, two = (
