@@ -74,7 +74,8 @@ itself, whose float64 is no longer finer than what it judges: w = 2^-52, twice t
 
 10. `exact-sign`. Nothing is moved and no sign is wrong, so 3 to 5 hold with w: what is certain, and what may
     be accepted, is so but for the judge's doubt. t is the watertight one where float32 is sure of all three
-    signs, else float64's with weights of one sign: 6 holds as it stands.
+    signs, else float64's with weights of one sign: 6 holds as it stands. u and v are float64's, so z of their
+    point and t d_z may differ by 6, or by the face's range, as well.
 11. `float64`. 1 to 7 hold with w. t is rounded to float32 last, which adds gamma_1 of it to 6; u and v are,
     which adds gamma_1 of the face's longest edge to the distance in 7, and gamma_1 of its range and of z
     along it.
@@ -89,7 +90,8 @@ itself, whose float64 is no longer finer than what it judges: w = 2^-52, twice t
         |t - t_exact| <= (err_T + |t_exact| err_det) / (|det| - err_det) + gamma_2 |t_exact|,
 
     of the plane's t; what it is clamped by is added. There is no convex combination: seen edge-on, t may be
-    anything. Single faces alone are certain: between two of them a ray may slip through. u and v are
+    anything. Which corner is a depends on the order in which the tracer has them: the largest of all three
+    counts. Single faces alone are certain: between two of them a ray may slip through. u and v are
     watertight ones, those below 0 taken for 0, so their point lies in the face: within 7's distance, and as
     far again as the ray lies outside, and its z within the face's range of t d_z, and by the error of t.
 
@@ -274,6 +276,8 @@ def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last:
     t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
     side = np.where(signs.det_low > 0, np.sign(signs.det) * np.sign(seen.depth), 0.0)
     rest = gamma(16, weights.unit) * seen.largest
+    # U and v of signs that are surer than t have weights of their own.
+    apart = 0.0 if signs is weights else np.minimum(t_bound * depth, np.ptp(weights.z, axis=0))
     return Pairs(
         t=t,
         t_bound=t_bound,
@@ -285,32 +289,22 @@ def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last:
         clear=signs.clear_edges() & seen.alive[:, None],
         ahead=t - t_bound > 0,
         lateral=weights.stray() + rest + last * weights.edge.max(axis=0),
-        depth_error=rest + seen.error_bound + last * (np.abs(z_hit) + 2 * np.ptp(weights.z, axis=0)),
+        depth_error=rest + seen.error_bound + apart + last * (np.abs(z_hit) + 2 * np.ptp(weights.z, axis=0)),
     )
 
 
 def _judge_fast(seen: _Seen) -> Pairs:
-    """Term 12."""
+    """Term 12, whichever corner the tracer counts from."""
     plane = _PlaneView.of(seen, UNIT_ROUNDOFF)
-    numbers = _FastNumbers(seen)
-    det, det_error = numbers.det
-    low = np.abs(det) - det_error
-    sign = np.sign(det)
-    (u, u_error), (v, v_error) = numbers.u, numbers.v
-    rest = sign * (det - u - v), det_error + u_error + v_error
-    edges = (rest, (sign * u, u_error), (sign * v, v_error))
-    over, over_error = numbers.over
-    t_plane = np.where(det != 0, over / np.where(det != 0, det, 1.0), 0.0) / seen.depth
-    t_bound = (over_error / np.abs(seen.depth) + np.abs(t_plane) * det_error + FLUSHED) / low
-    t_bound += gamma(2) * np.abs(t_plane)
-    z_hit = plane.depth_and_bound(seen.largest, seen.shear, seen.error_bound)[0]
-    t = z_hit / seen.depth
-    t_bound = np.where(low > 0, t_bound * 1.001 + np.abs(t - t_plane), np.inf)
-    accepted = np.all([weight >= -error for weight, error in edges], axis=0) | ~(low > 0)
-    outside = sum(np.maximum(-plane.weight(corner), 0.0) for corner in range(3))
+    turns = [_FastNumbers(seen, turn) for turn in range(3)]
+    low = np.min([turn.low for turn in turns], axis=0)
+    t = plane.depth_and_bound(seen.largest, seen.shear, seen.error_bound)[0] / seen.depth
+    t_bound = np.max([turn.t_bound + np.abs(t - turn.t) for turn in turns], axis=0)
+    t_bound = np.where(low > 0, t_bound, np.inf)
+    accepted = np.any([turn.accepted for turn in turns], axis=0) | ~(low > 0)
+    outside = np.sum([np.maximum(-plane.weight(corner), 0.0) for corner in range(3)], axis=0)
     farthest = plane.r.max(axis=0)
     stray = np.minimum(plane.stray() + 2 * outside * farthest, np.maximum(farthest, plane.delta_v))
-    extent = np.ptp(plane.z, axis=0) + seen.error_bound
     return Pairs(
         t=t,
         t_bound=t_bound,
@@ -318,29 +312,50 @@ def _judge_fast(seen: _Seen) -> Pairs:
         v=plane.weight(2),
         inside=seen.alive & plane.inside() & (t > 0),
         possible=seen.alive & accepted & (t + t_bound > 0),
-        side=np.where(seen.alive & (low > 0), sign * np.sign(seen.depth), 0).astype(np.int8),
-        clear=np.stack([weight > error for weight, error in edges], axis=1) & seen.alive[:, None],
+        side=np.where(seen.alive & (low > 0), np.sign(plane.det * seen.depth), 0).astype(np.int8),
+        clear=np.all([turn.clear for turn in turns], axis=0).T & seen.alive[:, None],
         ahead=t - t_bound > 0,
         lateral=stray + gamma(16) * seen.largest + np.sqrt(3.0) * seen.error_bound,
-        depth_error=extent + gamma(16) * seen.largest + t_bound * np.abs(seen.depth),
+        depth_error=np.ptp(plane.z, axis=0)
+        + seen.error_bound
+        + gamma(16) * seen.largest
+        + t_bound * np.abs(seen.depth),
     )
 
 
 class _FastNumbers:
-    """What Moeller and Trumbore compute of pairs, and by how much float32 may err: pairs of (k,)."""
+    """What Moeller and Trumbore compute of pairs, counting from corner `turn`, and by how much it may be off.
 
-    def __init__(self, seen: _Seen) -> None:
-        corners = seen.sheared.copy()
+    Attributes:
+        low: (k,), what the determinant's size is at the least.
+        t: (k,) of the plane.
+        t_bound: (k,).
+        accepted: (k,) bool, the edges' signs may be those of a hit.
+        clear: (3, k) bool, as in `Pairs`.
+    """
+
+    def __init__(self, seen: _Seen, turn: int) -> None:
+        corners = np.roll(seen.sheared, -turn, axis=1)
         # Back from the sheared plane: the axes of the shear, seen from the origin.
         corners[..., :2] += seen.shear.T[:, None] * corners[..., 2:]
         a, b, c = corners.transpose(1, 0, 2)
-        way = np.concatenate([seen.shear.T, np.ones((len(a), 1))], axis=1)
-        start, one, two = -a, b - a, c - a
-        moved, moved_edge = seen.error_bound, 2 * seen.error_bound
-        self.det = _volume((one, moved_edge), (way, 0.0), (two, moved_edge), 8)
-        self.u = _volume((start, moved), (way, 0.0), (two, moved_edge), 8)
-        self.v = _volume((way, 0.0), (start, moved), (one, moved_edge), 8)
-        self.over = _volume((two, moved_edge), (start, moved), (one, moved_edge), 10)
+        way = np.concatenate([seen.shear.T, np.ones((len(a), 1))], axis=1), 0.0
+        start, one, two = (-a, seen.error_bound), (b - a, 2 * seen.error_bound), (c - a, 2 * seen.error_bound)
+        det, det_error = _volume(one, way, two, 8)
+        u, u_error = _volume(start, way, two, 8)
+        v, v_error = _volume(way, start, one, 8)
+        over, over_error = _volume(two, start, one, 10)
+
+        sign = np.where(det < 0, -1.0, 1.0)
+        edges = sign * np.stack([det - u - v, u, v])
+        errors = np.stack([det_error + u_error + v_error, u_error, v_error])
+        self.accepted = (edges >= -errors).all(axis=0)
+        self.clear = np.roll(edges > errors, turn, axis=0)
+        self.low = np.abs(det) - det_error
+        along = over / np.where(det != 0, det, 1.0)
+        error = (over_error + np.abs(along) * det_error) / self.low + gamma(2) * np.abs(along)
+        self.t = along / seen.depth
+        self.t_bound = error / np.abs(seen.depth) + FLUSHED / self.low
 
 
 def _volume(
