@@ -92,8 +92,9 @@ itself, whose float64 is no longer finer than what it judges: w = 2^-52, twice t
     of the plane's t; what it is clamped by is added. There is no convex combination: seen edge-on, t may be
     anything. Which corner is a depends on the order in which the tracer has them: the largest of all three
     counts. Single faces alone are certain: between two of them a ray may slip through. u and v are
-    watertight ones, those below 0 taken for 0, so their point lies in the face: within 7's distance, and as
-    far again as the ray lies outside, and its z within the face's range of t d_z, and by the error of t.
+    watertight ones, those below 0 taken for 0, so their point lies in the face: within 7's distance and twice
+    what is taken, in parts of the farthest corner's (what weights are below 0 exactly, and by 3 over det_low
+    at most), no farther than that corner; its z within the face's range of t d_z, and by the error of t.
 
 **Tracers scale** positions and rays by powers of two, which is exact: the bound is that of the scaled frame,
 where the scene's largest coordinate is 1 to 2 and the direction's too. There the flushed terms are relative
@@ -303,8 +304,10 @@ def _judge_fast(seen: _Seen) -> Pairs:
     t_bound = np.where(low > 0, t_bound, np.inf)
     accepted = np.any([turn.accepted for turn in turns], axis=0) | ~(low > 0)
     outside = np.sum([np.maximum(-plane.weight(corner), 0.0) for corner in range(3)], axis=0)
-    farthest = plane.r.max(axis=0)
-    stray = np.minimum(plane.stray() + 2 * outside * farthest, np.maximum(farthest, plane.delta_v))
+    outside += (plane.swing + plane.rho).sum(axis=0) / plane.det_low
+    farthest = plane.r.max(axis=0) + plane.delta_v
+    stray = np.minimum(plane.stray() + 2 * outside * farthest, farthest)
+    stray = np.where(plane.det_low > 0, stray, farthest)
     return Pairs(
         t=t,
         t_bound=t_bound,
