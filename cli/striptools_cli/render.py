@@ -18,6 +18,7 @@ from striptools.trace.device import DeviceKind
 from striptools.trace.rays import Camera, turntable
 from striptools.trace.render import MOST_AO, RenderOptions, Shading, render, save_gif, save_png
 from striptools.trace.surface import Surface
+from striptools.types import TriangleTest
 from striptools_cli import log, notice
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes
@@ -89,6 +90,7 @@ def run(
     threads: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Threads to trace with.", show_default="every core")
     ] = None,
+    test: Annotated[TriangleTest, typer.Option(help="How triangles are tested; fast leaks.")] = "watertight",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
 ) -> None:
     """Draw a picture of a scene file, with the whole model in view, or of a model that turns.
@@ -116,7 +118,7 @@ def run(
         )
         notice.before_tracing(quiet=quiet)
         progress.watch("trace", 0.0)
-        tracer = Tracer(loaded, device=device, threads=threads)
+        tracer = Tracer(loaded, device=device, threads=threads, test=test)
         pictures.draw(tracer, loaded, cameras, options, progress)
     if not quiet:
         line = (

@@ -87,9 +87,15 @@ class Tracer:
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
             geometry once, for closest hits and any hits. "auto" flattens what fits in `memory_budget`, and
             shares where it does not or where `resident` is compressed.
+        test: How a ray and a triangle are tested (`trace.triangle_tests`; bounds in `measure.bound`):
+            "watertight" lets no ray slip through a closed surface, and counts as hit what is as near to it as
+            float32 rounds; "fast" is Moeller and Trumbore's, which leaks; "exact-sign" hits exactly what
+            exact arithmetic would, edges and corners included, t as of "watertight"; "float64" tests in
+            float64, and rounds t, u and v to float32 last. Tests other than the default one go through
+            wide nodes only, without packets and without a kernel; `contains` asks the default one.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or not both of them together; or
+        UsageError: There is no such device, hierarchy, residency or test, or not both of them together; or
             instances are to be shared of which one is too distorted for float32.
         LimitError: All instances have more triangles than a mesh may have, or, shared, than int32 can number;
             or the scene has no coordinate of 2**-126 or more.
@@ -213,7 +219,7 @@ class Tracer:
             t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
             counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
             packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side:
-                those of a camera or towards a light. Hits are the same.
+                those of a camera or towards a light. Hits are the same. Not of other tests than the default.
 
         Raises:
             UsageError: The arrays are not of these shapes, or not numbers.
