@@ -6,9 +6,10 @@ from fractions import Fraction
 from typing import get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 from rays import aimed_rays
@@ -85,9 +86,8 @@ def test_float32_signs_are_not_the_exact_ones() -> None:
 
 def exactly(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> list[int]:
     """Signs of the volumes opposite to the corners, along axes in the order of the shear, in fractions."""
-    b, c, d = ([Fraction(float(x)) for x in row] for row in (origin, direction, direction))
-    at = [[Fraction(float(x)) - o for x, o in zip(row, b, strict=True)] for row in corners]
-    del c
+    start, d = ([Fraction(float(x)) for x in row] for row in (origin, direction))
+    at = [[Fraction(float(x)) - o for x, o in zip(row, start, strict=True)] for row in corners]
 
     def volume(p, q):
         return (
@@ -124,17 +124,19 @@ def test_exact_signs_are_those_of_fractions(numbers: list[float], planar: int) -
 SIGNS = jax.jit(triangle_tests.exact_signs)
 
 
-def test_a_sign_of_float64_alone_may_be_wrong() -> None:
-    # What the expansion is for: 1 and 2^-100 are lost beside each other in 53 bits.
-    corners = np.array([[1, 1, 1], [1, 1 + 2**-23, 1], [2.0**-100, 0, 0]], np.float32)
-    given_to = tuple(tuple(corners[k, axis][None] for k in range(3)) for axis in range(3))
-    axes, one = tuple(np.uint32(k) for k in range(3)), np.float32(1)
-    zero = np.zeros(3, np.float32)
-    ray = np.array([2.0**-100, 1, 1], np.float32)
-    shear = Shear(axes, tuple(zero), one, one, one, tuple(ray))  # pyright: ignore[reportArgumentType]
-    assert np.asarray(SIGNS(given_to, shear))[:, 0].tolist() == exactly(corners, zero, ray)
-    d, b, c = ray.astype(np.float64), corners[1].astype(np.float64), corners[0].astype(np.float64)
-    assert np.asarray(SIGNS(given_to, shear))[2, 0] != np.sign((d * np.cross(c, b)).sum()) or d[0] > 0
+@given(st.lists(st.floats(-4, 4) | st.sampled_from([1.0, -1.0, 2.0**-100]), min_size=1, max_size=36))
+@example([1.0, 2.0**-100, -1.0])
+@limits(max_examples=100, deadline=None)
+def test_a_sum_has_its_exact_sign(numbers: list[float]) -> None:
+    # The example is what float64 alone gets wrong.
+    terms = np.zeros((36, 1))
+    terms[: len(numbers), 0] = numbers
+    with jax.enable_x64(True):
+        sign = int(np.asarray(SUM(terms))[0])
+    assert sign == int(np.sign(sum(Fraction(float(number)) for number in terms[:, 0])))
+
+
+SUM = jax.jit(triangle_tests._sign_of_sum)
 
 
 # ---- Within what bound.
@@ -240,13 +242,12 @@ def test_fast_leaks_and_the_others_do_not(ball) -> None:
 
 
 def test_a_hit_that_integers_deny_is_found(ball, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Without the exact step signs of zero are taken for what float64 says: some hits are others.
+    # Without doubt no sign is decided anew, and some hits are others.
     mesh, scene = ball
     rays = aimed_rays(mesh.positions, mesh.faces, 400, 2)
     expected = [len(row) for row in exact_hits(mesh, *rays)]
     assert tracer_of(scene, "exact-sign").count_hits(*rays).tolist() == expected
-    never = lambda corners, shear: np.zeros_like(corners[0][0])  # noqa: E731
-    monkeypatch.setattr(triangle_tests, "doubt_of", never)
+    monkeypatch.setattr(triangle_tests, "doubt_of", lambda corners, shear: jnp.float32(-1))
     program.cache_clear()
     try:
         assert tracer_of(scene, "exact-sign").count_hits(*rays).tolist() != expected
