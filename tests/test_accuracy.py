@@ -143,7 +143,7 @@ SUM = jax.jit(triangle_tests._sign_of_sum)
 
 
 @given(clean_meshes(), st.sampled_from(TESTS), st.sampled_from(["expanded", "compressed"]))
-@limits(max_examples=24, deadline=None)
+@limits(max_examples=18, deadline=None)
 def test_every_test_keeps_its_bound_on_any_mesh(mesh: Mesh, test: TriangleTest, resident: str) -> None:
     scene = scene_of_clean(mesh)
     report = verify(scene, mesh, FEW, tracer=tracer_of(scene, test, resident), test=test)
@@ -259,7 +259,7 @@ def test_a_hit_that_integers_deny_is_found(ball, monkeypatch: pytest.MonkeyPatch
 
 
 @given(clean_meshes(), st.sampled_from(TESTS), st.integers(0, 99))
-@limits(max_examples=12, deadline=None)
+@limits(max_examples=6, deadline=None)
 def test_hits_do_not_depend_on_residency_or_hierarchy(mesh: Mesh, test: TriangleTest, seed: int) -> None:
     scene = scene_of_clean(mesh)
     rays = aimed_rays(mesh.positions, mesh.faces, 64, seed)
