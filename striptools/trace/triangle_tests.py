@@ -167,7 +167,7 @@ def _float64(corners: Triangles, shear: Shear) -> Array:
     with jax.enable_x64(True):
         x, y, z, way = _in_double(corners, shear)
         zero = jnp.zeros_like(way[0])
-        upright = Shear(shear.axes, (zero,) * 3, way[0] / way[2], way[1] / way[2], 1 / way[2])
+        upright = Shear(shear.axes, (zero, zero, zero), way[0] / way[2], way[1] / way[2], 1 / way[2])
         edges = edges_of(x, y, z, upright, IN_DOUBLE)
         return _crossing_in_double(edges)
 
