@@ -280,11 +280,8 @@ def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last:
     # U and v of signs that are surer than t have weights of their own.
     apart = 0.0 if signs is weights else np.minimum(t_bound * depth, np.ptp(weights.z, axis=0))
     return Pairs(
-        t=t,
+        **_exact_numbers(seen, signs, t),
         t_bound=t_bound,
-        u=signs.weight(1),
-        v=signs.weight(2),
-        inside=seen.alive & signs.inside() & (t > 0),
         possible=seen.alive & signs.acceptable() & (t + t_bound > 0),
         side=np.where(seen.alive, side, 0).astype(np.int8),
         clear=signs.clear_edges() & seen.alive[:, None],
@@ -292,6 +289,12 @@ def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last:
         lateral=weights.stray() + rest + last * weights.edge.max(axis=0),
         depth_error=rest + seen.error_bound + apart + last * (np.abs(z_hit) + 2 * np.ptp(weights.z, axis=0)),
     )
+
+
+def _exact_numbers(seen: _Seen, plane: "_PlaneView", t: np.ndarray) -> dict[str, np.ndarray]:
+    """What a face says of its ray exactly, whatever traces it."""
+    inside = seen.alive & plane.inside() & (t > 0)
+    return {"t": t, "u": plane.weight(1), "v": plane.weight(2), "inside": inside}
 
 
 def _judge_fast(seen: _Seen) -> Pairs:
@@ -309,11 +312,8 @@ def _judge_fast(seen: _Seen) -> Pairs:
     stray = np.minimum(plane.stray() + 2 * outside * farthest, farthest)
     stray = np.where(plane.det_low > 0, stray, farthest)
     return Pairs(
-        t=t,
+        **_exact_numbers(seen, plane, t),
         t_bound=t_bound,
-        u=plane.weight(1),
-        v=plane.weight(2),
-        inside=seen.alive & plane.inside() & (t > 0),
         possible=seen.alive & accepted & (t + t_bound > 0),
         side=np.where(seen.alive & (low > 0), np.sign(plane.det * seen.depth), 0).astype(np.int8),
         clear=np.all([turn.clear for turn in turns], axis=0).T & seen.alive[:, None],

@@ -28,15 +28,15 @@ Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from striptools.trace.numerics import (
     BY_XLA,
-    SIGN,
     Arithmetic,
     larger,
     quotient,
     rounded,
+    sign_of,
     smaller,
     with_sign_of,
 )
@@ -143,7 +143,7 @@ def crossing_of(edges: Edges, turn: Array | None = None, arithmetic: Arithmetic 
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     determinant = _summed(a, b, c, turn)
     scaled_t = _summed(product(a, heights[0]), product(b, heights[1]), product(c, heights[2]), turn)
-    sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
+    sign = sign_of(determinant)
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
     return arithmetic.settled(arithmetic.quotient(scaled_t, with_sign_of(determinant, sign)))
 

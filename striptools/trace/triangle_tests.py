@@ -36,16 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from striptools.trace.numerics import (
-    BY_XLA,
-    SIGN,
-    Arithmetic,
-    larger,
-    quotient,
-    rounded,
-    smaller,
-    with_sign_of,
-)
+from striptools.trace import numerics
+from striptools.trace.numerics import BY_XLA, Arithmetic, quotient, rounded, sign_of, with_sign_of
 from striptools.trace.triangle import Corners, Edges, Shear, crossing_of, edges_of, sheared
 from striptools.types import TriangleTest
 
@@ -75,6 +67,7 @@ def crossings_by(
     turn: Array | None,
     shear: Shear,
     arithmetic: Arithmetic = BY_XLA,
+    filled: Array | None = None,
 ) -> Array:
     """Where a ray goes through triangles, float32: positive and finite only where it does.
 
@@ -84,11 +77,14 @@ def crossings_by(
         turn: Which corner is the first in the canonical order; None where that is corner a.
         shear: Of the ray.
         arithmetic: Of the compiler at hand; the default for tests other than the default one.
+        filled: Which of them there are; None where the others are not a number. Of those anything is told.
     """
     if test == "watertight":
         return crossing_of(edges_of(*corners, shear, arithmetic), turn, arithmetic)
     x, y, z = (_turned(axis, turn) for axis in corners)
-    crossing = {"fast": _fast, "exact-sign": _exact_sign, "float64": _float64}[test]
+    if test == "exact-sign":
+        return lax.optimization_barrier(_exact_sign((x, y, z), shear, filled))
+    crossing = _fast if test == "fast" else _float64
     return lax.optimization_barrier(crossing((x, y, z), shear))
 
 
@@ -114,7 +110,7 @@ def _fast(corners: Triangles, shear: Shear) -> Array:
     p = tilted_y - two[1], two[0] - tilted_x, twist
     q = _cross(start, one)
     determinant = _dot(one, p)
-    sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
+    sign = sign_of(determinant)
     size = with_sign_of(determinant, sign)
     u = with_sign_of(_dot(start, p), sign)
     v = with_sign_of(rounded(shear.x * q[0]) + rounded(shear.y * q[1]) + q[2], sign)
@@ -181,7 +177,7 @@ def _crossing_in_double(edges: Edges) -> Array:
     return t.astype(jnp.float32)
 
 
-def _exact_sign(corners: Triangles, shear: Shear) -> Array:
+def _exact_sign(corners: Triangles, shear: Shear, filled: Array | None) -> Array:
     """The watertight test where float32 is sure of its signs, and exact ones elsewhere."""
     edges = edges_of(*corners, shear)
     t = crossing_of(edges)
@@ -189,6 +185,9 @@ def _exact_sign(corners: Triangles, shear: Shear) -> Array:
     least, most = _ends((edges.a, edges.b, edges.c))
     # Not a sure miss, of two sure signs that differ; nor a sure hit; and not an empty lane, all of it NaN.
     doubtful = ((most <= doubt) | (least >= -doubt)) & (least <= doubt) & (most >= -doubt)
+    if filled is not None:
+        # Lanes that hold no triangle hold points that are one, of which nothing is ever sure.
+        doubtful = doubtful & filled
 
     def decided() -> Array:
         return jnp.where(doubtful, _decided(corners, shear, doubtful), t)
@@ -206,7 +205,7 @@ def doubt_of(corners: Triangles, shear: Shear) -> Array:
     is what is taken.
     """
     x, y, z = sheared(*corners, shear)
-    across = larger(_largest(x), _largest(y))
+    across = numerics.larger(_largest(x), _largest(y))
     reach = across + _largest(z)
     wider = across + reach * np.float32(2.0**-21)
     return rounded(wider * reach) * np.float32(2.0**-17) + FLUSHED
@@ -215,13 +214,13 @@ def doubt_of(corners: Triangles, shear: Shear) -> Array:
 def _largest(corners: Corners) -> Array:
     """The largest of three, in size."""
     a, b, c = (jnp.abs(each) for each in corners)
-    return larger(larger(a, b), c)
+    return numerics.larger(numerics.larger(a, b), c)
 
 
 def _ends(values: Corners) -> tuple[Array, Array]:
     """The least and the greatest of three; not a number where they are not."""
     a, b, c = values
-    return smaller(smaller(a, b), c), larger(larger(a, b), c)
+    return numerics.smaller(numerics.smaller(a, b), c), numerics.larger(numerics.larger(a, b), c)
 
 
 def _any(flags: Array) -> Array:

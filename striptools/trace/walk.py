@@ -125,7 +125,7 @@ class Leaf(NamedTuple):
         self, shear: Shear, arithmetic: Arithmetic = BY_XLA, test: TriangleTest = "watertight"
     ) -> Array:
         """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
-        t = crossings_by(test, (self.x, self.y, self.z), self.turn, shear, arithmetic)
+        t = crossings_by(test, (self.x, self.y, self.z), self.turn, shear, arithmetic, self.filled)
         return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
 
 
