@@ -23,7 +23,7 @@ def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: Tria
         test: Of triangles.
     """
     leaf = leaf_in(blocks, block, shear.axes)
-    t = leaf.crossings(shear, test=test)
+    t = leaf.crossings(shear, test=test, again=lambda: leaf_in(blocks, block, shear.axes))
     closer = (t > 0) & ((t < best.t) | ((t == best.t) & (leaf.name < best.name)))
     return replaced(best, closer, t, leaf.name)
 

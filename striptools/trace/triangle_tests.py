@@ -29,6 +29,7 @@ bit of the one, and makes the other no worse. TwoSum has no product. XLA does no
 `measure.arithmetic` probes.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -41,13 +42,37 @@ from striptools.trace.numerics import BY_XLA, Arithmetic, quotient, rounded, sig
 from striptools.trace.triangle import Corners, Edges, Shear, crossing_of, edges_of, sheared
 from striptools.types import TriangleTest
 
-Triangles = tuple[Corners, Corners, Corners]
+Points = tuple[Corners, Corners, Corners]
 """Coordinates x, y, z of corners a, b, c, along the axes of a shear."""
+
+
+class Triangles(NamedTuple):
+    """What a test is told of triangles.
+
+    Attributes:
+        x, y, z: Of corners a, b, c, along the axes of a shear.
+        turn: Which corner is the first in the canonical order; None where that is corner a.
+        filled: Which of them there are; None where the others are not a number. Of those anything is told.
+    """
+
+    x: Corners
+    y: Corners
+    z: Corners
+    turn: Array | None
+    filled: Array | None
+
+    def in_order(self) -> Points:
+        """Corners in the canonical order."""
+        return _turned(self.x, self.turn), _turned(self.y, self.turn), _turned(self.z, self.turn)
+
 
 LOWEST_DOUBLE = np.finfo(np.float64).min
 
 FLUSHED = np.float32(2.0**-120)
 """What flushed denormals may change of a float32 edge function, and much more."""
+
+IN_DOUBT = numerics.LOWEST
+"""In the place of a t: not minus infinity, which stands for some misses."""
 
 HIGH_HALF = np.int64(-(2**29))
 """The bits of a float64 that a float32 has too."""
@@ -63,29 +88,27 @@ def wants_way(test: TriangleTest) -> bool:
 
 def crossings_by(
     test: TriangleTest,
-    corners: Triangles,
-    turn: Array | None,
+    triangles: Triangles,
     shear: Shear,
     arithmetic: Arithmetic = BY_XLA,
-    filled: Array | None = None,
+    again: Callable[[], Triangles] | None = None,
 ) -> Array:
     """Where a ray goes through triangles, float32: positive and finite only where it does.
 
     Args:
         test: By which test.
-        corners: Of the triangles.
-        turn: Which corner is the first in the canonical order; None where that is corner a.
+        triangles: Which ones.
         shear: Of the ray.
         arithmetic: Of the compiler at hand; the default for tests other than the default one.
-        filled: Which of them there are; None where the others are not a number. Of those anything is told.
+        again: Makes the same triangles, where they have to be told once more.
     """
     if test == "watertight":
-        return crossing_of(edges_of(*corners, shear, arithmetic), turn, arithmetic)
-    x, y, z = (_turned(axis, turn) for axis in corners)
+        x, y, z, turn, _ = triangles
+        return crossing_of(edges_of(x, y, z, shear, arithmetic), turn, arithmetic)
     if test == "exact-sign":
-        return lax.optimization_barrier(_exact_sign((x, y, z), shear, filled))
+        return _exact_sign(triangles, shear, again or (lambda: triangles))
     crossing = _fast if test == "fast" else _float64
-    return lax.optimization_barrier(crossing((x, y, z), shear))
+    return lax.optimization_barrier(crossing(triangles.in_order(), shear))
 
 
 def _turned(corners: Corners, turn: Array | None) -> Corners:
@@ -100,7 +123,7 @@ def _turned(corners: Corners, turn: Array | None) -> Corners:
     return first, second, third
 
 
-def _fast(corners: Triangles, shear: Shear) -> Array:
+def _fast(corners: Points, shear: Shear) -> Array:
     """Moeller and Trumbore."""
     (ax, bx, cx), (ay, by, cy), (az, bz, cz) = corners
     one, two = (bx - ax, by - ay, bz - az), (cx - ax, cy - ay, cz - az)
@@ -137,7 +160,7 @@ class _Double(NamedTuple):
     way: tuple[Array, Array, Array]
 
 
-def _in_double(corners: Triangles, shear: Shear) -> _Double:
+def _in_double(corners: Points, shear: Shear) -> _Double:
     """Take a ray and triangles to float64; to be called where x64 is enabled."""
     assert shear.way is not None
     x, y, z = (
@@ -158,7 +181,7 @@ IN_DOUBLE = BY_XLA._replace(product=_rounded_double)
 """Arithmetic of float64, as far as `edges_of` asks."""
 
 
-def _float64(corners: Triangles, shear: Shear) -> Array:
+def _float64(corners: Points, shear: Shear) -> Array:
     """The watertight test in float64."""
     with jax.enable_x64(True):
         x, y, z, way = _in_double(corners, shear)
@@ -177,25 +200,36 @@ def _crossing_in_double(edges: Edges) -> Array:
     return t.astype(jnp.float32)
 
 
-def _exact_sign(corners: Triangles, shear: Shear, filled: Array | None) -> Array:
-    """The watertight test where float32 is sure of its signs, and exact ones elsewhere."""
+def _exact_sign(triangles: Triangles, shear: Shear, again: Callable[[], Triangles]) -> Array:
+    """The watertight test where float32 is sure of its signs, and exact ones elsewhere.
+
+    Doubt is told in the place of t, and triangles in doubt are made again: two uses of a packed leaf would
+    have it decoded twice, and a branch that takes its corners would have them kept.
+    """
+    corners = triangles.in_order()
     edges = edges_of(*corners, shear)
-    t = crossing_of(edges)
     doubt = doubt_of(corners, shear)
     least, most = _ends((edges.a, edges.b, edges.c))
     # Not a sure miss, of two sure signs that differ; nor a sure hit; and not an empty lane, all of it NaN.
     doubtful = ((most <= doubt) | (least >= -doubt)) & (least <= doubt) & (most >= -doubt)
-    if filled is not None:
+    if triangles.filled is not None:
         # Lanes that hold no triangle hold points that are one, of which nothing is ever sure.
-        doubtful = doubtful & filled
+        doubtful = doubtful & triangles.filled
+    t = crossing_of(edges, arithmetic=UNSETTLED)
+    t = lax.optimization_barrier(jnp.where(doubtful, IN_DOUBT, t))
+    doubtful = t == IN_DOUBT
 
     def decided() -> Array:
-        return jnp.where(doubtful, _decided(corners, shear, doubtful), t)
+        return jnp.where(doubtful, _decided(again().in_order(), shear, doubtful), t)
 
     return lax.cond(_any(doubtful), decided, lambda: t)
 
 
-def doubt_of(corners: Triangles, shear: Shear) -> Array:
+UNSETTLED = BY_XLA._replace(settled=lambda value: value)
+"""Arithmetic of a value that is settled later."""
+
+
+def doubt_of(corners: Points, shear: Shear) -> Array:
     """Beyond which size a watertight edge function surely has the sign of the volume it stands for.
 
     With u = 2^-24, S the largest sheared coordinate of the corners and H their largest height, M = S + H is
@@ -266,7 +300,7 @@ def _volume(seen: _Double, j: int, k: int) -> tuple[Array, Array]:
     return volume, sizes[0] + sizes[1] + sizes[2]
 
 
-def exact_signs(corners: Triangles, shear: Shear) -> Array:
+def exact_signs(corners: Points, shear: Shear) -> Array:
     """(3, ...) int32, -1, 0 or 1: the signs of the volumes of the edges opposite to corners a, b and c."""
     with jax.enable_x64(True):
         x, y, z = ([at.astype(jnp.float64) for at in axis] for axis in corners)

@@ -46,7 +46,7 @@ from striptools.trace.numerics import (
     smaller,
 )
 from striptools.trace.triangle import Corners, Shear, pick, shear_of
-from striptools.trace.triangle_tests import crossings_by, wants_way
+from striptools.trace.triangle_tests import Triangles, crossings_by, wants_way
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 from striptools.types import TriangleTest
 
@@ -122,11 +122,28 @@ class Leaf(NamedTuple):
     name: Array
 
     def crossings(
-        self, shear: Shear, arithmetic: Arithmetic = BY_XLA, test: TriangleTest = "watertight"
+        self,
+        shear: Shear,
+        arithmetic: Arithmetic = BY_XLA,
+        test: TriangleTest = "watertight",
+        again: "Callable[[], Leaf] | None" = None,
     ) -> Array:
-        """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
-        t = crossings_by(test, (self.x, self.y, self.z), self.turn, shear, arithmetic, self.filled)
+        """(8,) float32: t at which the ray goes through each triangle; positive and finite only there.
+
+        Args:
+            shear: Of the ray.
+            arithmetic: Of the compiler at hand.
+            test: Of triangles.
+            again: Makes the same leaf: for what is rarely computed, so that nothing is kept for it.
+        """
+        again = again or (lambda: self)
+        t = crossings_by(test, self.triangles, shear, arithmetic, lambda: again().triangles)
         return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
+
+    @property
+    def triangles(self) -> Triangles:
+        """What a test is told."""
+        return Triangles(self.x, self.y, self.z, self.turn, self.filled)
 
 
 class WalkScene(Protocol):
