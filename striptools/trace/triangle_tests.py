@@ -262,7 +262,7 @@ def _any(flags: Array) -> Array:
     return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
 
 
-def _decided(corners: Triangles, shear: Shear, doubtful: Array) -> Array:
+def _decided(corners: Points, shear: Shear, doubtful: Array) -> Array:
     """Where a ray goes through triangles, by exact signs; t in float64 of weights of those signs."""
     with jax.enable_x64(True):
         seen = _in_double(corners, shear)
