@@ -4,6 +4,8 @@ Axis names: `v` mesh vertices, `f` faces of the loaded mesh, `n` faces that clea
 scene), `s` strips, `c` strip vertices (a strip of k triangles has k + 2), `r` rays.
 """
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8, UInt32
 
@@ -28,6 +30,9 @@ Rotations = UInt8[np.ndarray, " n"]
 RayVectors = Float32[np.ndarray, "r 3"]
 """Ray origins or directions; directions need not be of unit length, and t is in units of their length."""
 
+TriangleTest = Literal["watertight", "fast", "exact-sign", "float64"]
+"""How a tracer tests a ray and a triangle: `trace.triangle_tests`; within what bound: `measure.bound`."""
+
 Bools = Bool[np.ndarray, " n"]
 Doubles = Float64[np.ndarray, " n"]
 Counts = Int32[np.ndarray, " n"]
@@ -44,5 +49,6 @@ __all__ = [
     "RayVectors",
     "Rotations",
     "SourcePositions",
+    "TriangleTest",
     "Words",
 ]

@@ -84,7 +84,7 @@ def _record(result: RowResult) -> dict[str, object]:
     flaws = [
         f"{mode.name}: {outcome.detail}"
         for mode, outcome in zip(result.modes, result.outcomes, strict=True)
-        if outcome.verdict != row.verdict(grid=mode.on_grid)
+        if not mode.expects(row, outcome.verdict)
     ]
     return {
         "row": row.name,

@@ -17,6 +17,7 @@ from striptools.trace import Tracer
 from striptools.trace.rays import Camera, turntable
 from striptools.trace.render import MOST_AO, RenderOptions, Shading, render, save_gif, save_png
 from striptools.trace.surface import Surface
+from striptools.types import TriangleTest
 from striptools_cli import log, notice
 from striptools_cli.options import SceneFile, quiet_option
 from striptools_cli.options_trace import Device, TraceThreads, Up
@@ -84,6 +85,7 @@ def run(
     force: Annotated[bool, typer.Option("--force", help="Replace pictures that exist.")] = False,
     device: Device = "auto",
     threads: TraceThreads = None,
+    test: Annotated[TriangleTest, typer.Option(help="How triangles are tested; fast leaks.")] = "watertight",
     quiet: Annotated[bool, quiet_option()] = False,
 ) -> None:
     """Draw a picture of a scene file, with the whole model in view, or of a model that turns.
@@ -111,7 +113,7 @@ def run(
         )
         notice.before_tracing(quiet=quiet)
         progress.watch("trace", 0.0)
-        tracer = Tracer(loaded, device=device, threads=threads)
+        tracer = Tracer(loaded, device=device, threads=threads, test=test)
         pictures.draw(tracer, loaded, cameras, options, progress)
     if not quiet:
         line = (

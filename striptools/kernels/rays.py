@@ -188,3 +188,24 @@ def ready_rays(
         at[count] = r
         count += 1
     return count, every
+
+
+@kernel
+def add_ways(directions, at, rays, words):
+    """Write the directions behind ready rays, scaled, along the axes of their shears: see `trace.walk`.
+
+    Args:
+        directions: (r, 3) float32.
+        at: (k,) int32, which ray each row is.
+        rays: (k, 27) float32; columns 24 to 26 are written.
+        words: The same memory as int32.
+    """
+    for row in range(len(at)):
+        r = at[row]
+        dx, dy, dz = flushed(directions[r, 0]), flushed(directions[r, 1]), flushed(directions[r, 2])
+        longest = larger(larger(abs(dx), abs(dy)), abs(dz))
+        exponent = min(max(np.float32(longest).view(np.int32) >> 23, 1), 253)
+        shorten = np.int32((254 - exponent) << 23).view(np.float32)
+        dx, dy, dz = flushed(dx * shorten), flushed(dy * shorten), flushed(dz * shorten)
+        for axis in range(3):
+            rays[row, ROW + axis] = picked(dx, dy, dz, words[row, 17 + axis])

@@ -68,6 +68,34 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    faces that are accepted by rounding, so that every hierarchy finds the same: `trace.box` and
    `trace.walk_packed` derive theirs. `beyond_box` tells how much a reported hit needed.
 
+**The other triangle tests** (`trace.triangle_tests`). What terms 1 to 8 say of the watertight one they say of
+these with another unit roundoff in the place of u = 2^-24, for the tracer's part and for that of the judge
+itself, whose float64 is no longer finer than what it judges: w = 2^-52, twice that of float64.
+
+10. `exact-sign`. Nothing is moved and no sign is wrong, so 3 to 5 hold with w: what is certain, and what may
+    be accepted, is so but for the judge's doubt. t is the watertight one where float32 is sure of all three
+    signs, else float64's with weights of one sign: 6 holds as it stands. u and v are float64's, so z of their
+    point and t d_z may differ by 6, or by the face's range, as well.
+11. `float64`. 1 to 7 hold with w. t is rounded to float32 last, which adds gamma_1 of it to 6; u and v are,
+    which adds gamma_1 of the face's longest edge to the distance in 7, and gamma_1 of its range and of z
+    along it.
+12. `fast`. With s = o - a, e and f the edges from corner a and d = (S_x, S_y, 1), det = e . (d x f), U = s .
+    (d x f), V = d . (s x e), T = f . (s x e): each a sum of six products of three numbers. A number has one
+    rounding, a product and sum of them five more at most (six for V's and T's order), so each is off by
+    gamma_8 of the sum of the sizes of its products; T, times 1 / d_z, by gamma_10. D moves s by D and an edge
+    by 2 D on each axis: what that adds to the sum of sizes is added too. Accepted are s U >= -err_U, s V >=
+    -err_V and s (U + V) <= |det| + err_det + err_U + err_V, the other way round where a sign is certain; all,
+    where det may be zero. Then
+
+        |t - t_exact| <= (err_T + |t_exact| err_det) / (|det| - err_det) + gamma_2 |t_exact|,
+
+    of the plane's t; what it is clamped by is added. There is no convex combination: seen edge-on, t may be
+    anything. Which corner is a depends on the order in which the tracer has them: the largest of all three
+    counts. Single faces alone are certain: between two of them a ray may slip through. u and v are
+    watertight ones, those below 0 taken for 0, so their point lies in the face: within 7's distance and twice
+    what is taken, in parts of the farthest corner's (what weights are below 0 exactly, and by 3 over det_low
+    at most), no farther than that corner; its z within the face's range of t d_z, and by the error of t.
+
 **Tracers scale** positions and rays by powers of two, which is exact: the bound is that of the scaled frame,
 where the scene's largest coordinate is 1 to 2 and the direction's too. There the flushed terms are relative
 to the scene, and M < 2^40 is a distance in parts of it: `extremes` judges in that frame.
@@ -81,7 +109,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from striptools.types import TriangleTest
+
 UNIT_ROUNDOFF = 2.0**-24
+DOUBLE_ROUNDOFF = 2.0**-52
+"""Twice that of float64: the tracer's part, and that of the judge."""
+
 LARGEST_COORDINATE = 2.0**40
 FLUSHED = 2.0**-122
 EDGE_ON = 2.0**-50
@@ -94,9 +127,9 @@ BEYOND_FACE = 8.0
 """How many delta_v from the ray a face may lie and still be reported (term 5 of the head)."""
 
 
-def gamma(n: int) -> float:
-    """The relative error of n float32 roundings in a row, gamma_n = n u / (1 - n u)."""
-    return n * UNIT_ROUNDOFF / (1 - n * UNIT_ROUNDOFF)
+def gamma(n: int, unit: float = UNIT_ROUNDOFF) -> float:
+    """The relative error of n roundings in a row, those of float32 by default: gamma_n = n u / (1 - n u)."""
+    return n * unit / (1 - n * unit)
 
 
 @dataclass(frozen=True)
@@ -187,13 +220,19 @@ def shear_points(frames: RayFrames, ray: np.ndarray, points: np.ndarray) -> np.n
     return a
 
 
-def lateral_slack(largest: np.ndarray, error_bound: float) -> np.ndarray:
+def lateral_slack(largest: np.ndarray, error_bound: float, unit: float = UNIT_ROUNDOFF) -> np.ndarray:
     """delta_v for corners that lie within `largest` of the ray's origin on every axis."""
-    slack = np.sqrt(2.0) * gamma(7) * largest + np.sqrt(3.0) * error_bound + FLUSHED
+    slack = np.sqrt(2.0) * gamma(7, unit) * largest + np.sqrt(3.0) * error_bound + FLUSHED
     return np.where(largest < LARGEST_COORDINATE, slack, np.inf)
 
 
-def judge_pairs(frames: RayFrames, ray: np.ndarray, corners: np.ndarray, error_bound: float = 0.0) -> Pairs:
+def judge_pairs(
+    frames: RayFrames,
+    ray: np.ndarray,
+    corners: np.ndarray,
+    error_bound: float = 0.0,
+    test: TriangleTest = "watertight",
+) -> Pairs:
     """Judge pairs of a ray and a face.
 
     Args:
@@ -201,45 +240,160 @@ def judge_pairs(frames: RayFrames, ray: np.ndarray, corners: np.ndarray, error_b
         ray: (k,) index of each pair's ray.
         corners: (k, 3, 3) float64, the face's corners, whose components are float32 values.
         error_bound: D, how far the traced vertices may lie off these, in the model's unit.
+        test: What the tracer tests triangles by.
     """
     largest = np.abs(corners - frames.origins[ray][:, None]).max(axis=(1, 2)) + error_bound
-    delta_v = lateral_slack(largest, error_bound)
     sheared = shear_points(frames, ray, corners)
-    x, y, z = sheared[..., 0].T, sheared[..., 1].T, sheared[..., 2].T
+    alive = frames.valid[ray] & np.isfinite(sheared).all(axis=(1, 2))
+    seen = _Seen(sheared, frames.shear[ray].T, frames.depth[ray], largest, error_bound, alive)
     with np.errstate(all="ignore"):
-        plane = _PlaneView(x, y, z, delta_v)
-        depth = np.abs(frames.depth[ray])
-        z_hit, z_bound = plane.depth_and_bound(gamma(12) * largest, frames.shear[ray].T, error_bound)
-        t_bound = z_bound / depth + np.where(plane.det_low > 0, FLUSHED / plane.det_low, 0.0)
-        t = z_hit / frames.depth[ray]
-        t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
-        alive = frames.valid[ray] & np.isfinite(sheared).all(axis=(1, 2))
-        side = np.where(plane.det_low > 0, np.sign(plane.det) * np.sign(frames.depth[ray]), 0.0)
-        return Pairs(
-            t=t,
-            t_bound=t_bound,
-            u=plane.weight(1),
-            v=plane.weight(2),
-            inside=alive & plane.inside() & (t > 0),
-            possible=alive & plane.acceptable() & (t + t_bound > 0),
-            side=np.where(alive, side, 0).astype(np.int8),
-            clear=plane.clear_edges() & alive[:, None],
-            ahead=t - t_bound > 0,
-            lateral=plane.stray() + gamma(16) * largest,
-            depth_error=gamma(16) * largest + error_bound,
+        if test == "fast":
+            return _judge_fast(seen)
+        signs = _PlaneView.of(seen, UNIT_ROUNDOFF if test == "watertight" else DOUBLE_ROUNDOFF)
+        weights = signs if test != "exact-sign" else _PlaneView.of(seen, UNIT_ROUNDOFF)
+        return _judge_signed(seen, signs, weights, last=gamma(1) if test == "float64" else 0.0)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Pairs of a ray and a face: corners (k, 3, 3) as the ray sees them, its shear (2, k), depth, and M."""
+
+    sheared: np.ndarray
+    shear: np.ndarray
+    depth: np.ndarray
+    largest: np.ndarray
+    error_bound: float
+    alive: np.ndarray
+
+
+def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last: float) -> Pairs:
+    """Terms 3 to 7, 10 and 11: signs as one view has them, t and weights as another, all rounded last."""
+    rounding = gamma(12, weights.unit) * seen.largest
+    z_hit, z_bound = weights.depth_and_bound(rounding, seen.shear, seen.error_bound)
+    depth = np.abs(seen.depth)
+    t_bound = z_bound / depth + np.where(weights.det_low > 0, FLUSHED / weights.det_low, 0.0)
+    t = z_hit / seen.depth
+    t_bound = t_bound + last * (np.abs(t) + t_bound)
+    t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
+    side = np.where(signs.det_low > 0, np.sign(signs.det) * np.sign(seen.depth), 0.0)
+    rest = gamma(16, weights.unit) * seen.largest
+    # U and v of signs that are surer than t have weights of their own.
+    apart = 0.0 if signs is weights else np.minimum(t_bound * depth, np.ptp(weights.z, axis=0))
+    return Pairs(
+        **_exact_numbers(seen, signs, t),
+        t_bound=t_bound,
+        possible=seen.alive & signs.acceptable() & (t + t_bound > 0),
+        side=np.where(seen.alive, side, 0).astype(np.int8),
+        clear=signs.clear_edges() & seen.alive[:, None],
+        ahead=t - t_bound > 0,
+        lateral=weights.stray() + rest + last * weights.edge.max(axis=0),
+        depth_error=rest + seen.error_bound + apart + last * (np.abs(z_hit) + 2 * np.ptp(weights.z, axis=0)),
+    )
+
+
+def _exact_numbers(seen: _Seen, plane: "_PlaneView", t: np.ndarray) -> dict[str, np.ndarray]:
+    """What a face says of its ray exactly, whatever traces it."""
+    inside = seen.alive & plane.inside() & (t > 0)
+    return {"t": t, "u": plane.weight(1), "v": plane.weight(2), "inside": inside}
+
+
+def _judge_fast(seen: _Seen) -> Pairs:
+    """Term 12, whichever corner the tracer counts from."""
+    plane = _PlaneView.of(seen, UNIT_ROUNDOFF)
+    turns = [_FastNumbers(seen, turn) for turn in range(3)]
+    low = np.min([turn.low for turn in turns], axis=0)
+    t = plane.depth_and_bound(seen.largest, seen.shear, seen.error_bound)[0] / seen.depth
+    t_bound = np.max([turn.t_bound + np.abs(t - turn.t) for turn in turns], axis=0)
+    t_bound = np.where(low > 0, t_bound, np.inf)
+    accepted = np.any([turn.accepted for turn in turns], axis=0) | ~(low > 0)
+    outside = np.sum([np.maximum(-plane.weight(corner), 0.0) for corner in range(3)], axis=0)
+    outside += (plane.swing + plane.rho).sum(axis=0) / plane.det_low
+    farthest = plane.r.max(axis=0) + plane.delta_v
+    stray = np.minimum(plane.stray() + 2 * outside * farthest, farthest)
+    stray = np.where(plane.det_low > 0, stray, farthest)
+    return Pairs(
+        **_exact_numbers(seen, plane, t),
+        t_bound=t_bound,
+        possible=seen.alive & accepted & (t + t_bound > 0),
+        side=np.where(seen.alive & (low > 0), np.sign(plane.det * seen.depth), 0).astype(np.int8),
+        clear=np.all([turn.clear for turn in turns], axis=0).T & seen.alive[:, None],
+        ahead=t - t_bound > 0,
+        lateral=stray + gamma(16) * seen.largest + np.sqrt(3.0) * seen.error_bound,
+        depth_error=np.ptp(plane.z, axis=0)
+        + seen.error_bound
+        + gamma(16) * seen.largest
+        + t_bound * np.abs(seen.depth),
+    )
+
+
+class _FastNumbers:
+    """What Moeller and Trumbore compute of pairs, counting from corner `turn`, and by how much it may be off.
+
+    Attributes:
+        low: (k,), what the determinant's size is at the least.
+        t: (k,) of the plane.
+        t_bound: (k,).
+        accepted: (k,) bool, the edges' signs may be those of a hit.
+        clear: (3, k) bool, as in `Pairs`.
+    """
+
+    def __init__(self, seen: _Seen, turn: int) -> None:
+        corners = np.roll(seen.sheared, -turn, axis=1)
+        # Back from the sheared plane: the axes of the shear, seen from the origin.
+        corners[..., :2] += seen.shear.T[:, None] * corners[..., 2:]
+        a, b, c = corners.transpose(1, 0, 2)
+        way = np.concatenate([seen.shear.T, np.ones((len(a), 1))], axis=1), 0.0
+        start, one, two = (-a, seen.error_bound), (b - a, 2 * seen.error_bound), (c - a, 2 * seen.error_bound)
+        det, det_error = _volume(one, way, two, 8)
+        u, u_error = _volume(start, way, two, 8)
+        v, v_error = _volume(way, start, one, 8)
+        over, over_error = _volume(two, start, one, 10)
+
+        sign = np.where(det < 0, -1.0, 1.0)
+        edges = sign * np.stack([det - u - v, u, v])
+        errors = np.stack([det_error + u_error + v_error, u_error, v_error])
+        self.accepted = (edges >= -errors).all(axis=0)
+        self.clear = np.roll(edges > errors, turn, axis=0)
+        self.low = np.abs(det) - det_error
+        along = over / np.where(det != 0, det, 1.0)
+        error = (over_error + np.abs(along) * det_error) / self.low + gamma(2) * np.abs(along)
+        self.t = along / seen.depth
+        self.t_bound = error / np.abs(seen.depth) + FLUSHED / self.low
+
+
+def _volume(
+    a: tuple[np.ndarray, float], b: tuple[np.ndarray, float], c: tuple[np.ndarray, float], roundings: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The volume a . (b x c) of vectors (k, 3), each moved on each axis by so much, and how far it is off."""
+
+    def sizes(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        one, two = (
+            np.roll(b, -1, axis=1) * np.roll(c, -2, axis=1),
+            np.roll(b, -2, axis=1) * np.roll(c, -1, axis=1),
         )
+        return (a * (one + two)).sum(axis=1)
+
+    exact = (a[0] * np.cross(b[0], c[0])).sum(axis=1)
+    still = sizes(*(np.abs(vector) for vector, _ in (a, b, c)))
+    moved = sizes(*(np.abs(vector) + by for vector, by in (a, b, c)))
+    return exact, gamma(roundings) * moved + (moved - still) + FLUSHED
 
 
 class _PlaneView:
     """Faces in the plane in which their ray is the point 0: rows of `x`, `y`, `z`, `r`, `U` are corners."""
 
-    def __init__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, delta_v: np.ndarray) -> None:
-        self.x, self.y, self.z, self.delta_v = x, y, z, delta_v
+    @classmethod
+    def of(cls, seen: _Seen, unit: float) -> "_PlaneView":
+        x, y, z = (seen.sheared[..., axis].T for axis in range(3))
+        return cls(x, y, z, lateral_slack(seen.largest, seen.error_bound, unit), unit)
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, delta_v: np.ndarray, unit: float) -> None:
+        self.x, self.y, self.z, self.delta_v, self.unit = x, y, z, delta_v, unit
         j, k = [1, 2, 0], [2, 0, 1]
         self.cross = x[j] * y[k] - y[j] * x[k]
         self.edge = np.hypot(x[k] - x[j], y[k] - y[j])
         self.r = np.hypot(x, y)
-        self.rho = gamma(3) * (self.r[j] + delta_v) * (self.r[k] + delta_v) + FLUSHED / 4
+        self.rho = gamma(3, unit) * (self.r[j] + delta_v) * (self.r[k] + delta_v) + FLUSHED / 4
         self.swing = delta_v * (self.r[j] + self.r[k] + delta_v)
         self.det = self.cross.sum(axis=0)
         det_error = delta_v * self.edge.sum(axis=0) + 3 * delta_v**2 + 2 * self.rho.sum(axis=0)

@@ -4,8 +4,9 @@ How a case is judged. It is converted once for each precision and traced by each
 are taken into the frame in which the scene's largest coordinate and each direction's are 1 to 2, by powers of
 two, where the bound is what `bound` derives. There the float64 oracle judges as `verify` does. Where float64
 is in doubt integers decide (`exact`): of each reported hit t is compared with the exact one, and of the faces
-near a ray none is certain that the exact ray misses, none impossible that it hits. Modes of one precision
-have to agree bit for bit, closest hits and any hits. What comes out for finite rays is finite.
+near a ray none is certain that the exact ray misses, none impossible that it hits. Modes of one precision and
+one triangle test have to agree bit for bit, closest hits and any hits. What comes out for finite rays is
+finite. What `exact-sign` hits, integers say is hit; `fast` may leak.
 
 Error over bound is the largest of: t over its bound, the hit point over its bound, and the move of a vertex
 over the scene's declared bound. 1 would be a bound that is met; above it is a violation.
@@ -24,7 +25,7 @@ from striptools.measure.aimed import Surface
 from striptools.measure.arithmetic import Probe, probe_arithmetic
 from striptools.measure.bound import RayFrames, beyond_box, frame_rays, judge_pairs, shear_points
 from striptools.measure.exact import exact_pair
-from striptools.measure.extreme_rows import ERROR, KEPT, LARGEST, LIMIT, ROWS, Case, Row, aimed_case
+from striptools.measure.extreme_rows import ERROR, KEPT, LARGEST, LEAKS, LIMIT, ROWS, Case, Row, aimed_case
 from striptools.measure.judgement import Judge, compare_reported
 from striptools.measure.oracle import Oracle
 from striptools.measure.ray_sets import RaySet
@@ -34,6 +35,7 @@ from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Remap, Scene
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits
+from striptools.types import TriangleTest
 
 CHUNK = 1 << 18
 """Faces handled at a time where a mesh may be large."""
@@ -78,18 +80,31 @@ class Mode:
         """Whether positions are quantised."""
         return not self.options.precision.is_lossless
 
+    @property
+    def test(self) -> TriangleTest:
+        """What triangles are tested by."""
+        return self.tracer.get("test", "watertight")
+
+    def expects(self, row: Row, verdict: str) -> bool:
+        """Whether a verdict is one that a row expects of this mode."""
+        wanted = row.verdict(grid=self.on_grid)
+        leaks = self.test == "fast" and verdict == LEAKS and wanted in (KEPT, LIMIT)
+        return verdict == wanted or leaks
+
 
 WALKS: dict[str, dict[str, Any]] = {
     "expanded": {"resident": "expanded"},
     "rebuilt": {"hierarchy": "rebuilt", "resident": "expanded"},
     "compressed": {"resident": "compressed"},
 }
+TESTS: tuple[TriangleTest, ...] = ("fast", "exact-sign", "float64")
 LOSSLESS, SIXTEEN_BITS = Options(), Options(precision=PrecisionOptions(bits=16))
 MODES: tuple[Mode, ...] = (
     *(Mode(name, LOSSLESS, asked) for name, asked in WALKS.items()),
+    *(Mode(test, LOSSLESS, {"resident": "expanded", "test": test}) for test in TESTS),
     *(Mode(f"{name}, 16 bits", SIXTEEN_BITS, asked) for name, asked in WALKS.items()),
 )
-"""Modes of equal options stand together: they share a scene, and their hits must be the same."""
+"""Modes of equal options stand together and share a scene; hits of one triangle test must be the same."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +134,7 @@ class Outcome:
 
     def joined(self, other: "Outcome") -> "Outcome":
         """Both as one: what is wrong outweighs a limit, an error, and what is right."""
-        order = (KEPT, ERROR, LIMIT, VIOLATED)
+        order = (KEPT, ERROR, LIMIT, LEAKS, VIOLATED)
         worse = max(self, other, key=lambda one: order.index(one.verdict))
         names = ("t_ratio", "point_ratio", "move_ratio", "box_need")
         most = {name: max(getattr(self, name), getattr(other, name)) for name in names}
@@ -144,7 +159,7 @@ class RowResult:
     def ok(self) -> bool:
         """Whether every mode did what was expected."""
         pairs = zip(self.modes, self.outcomes, strict=True)
-        return all(self.row.verdict(grid=mode.on_grid) == outcome.verdict for mode, outcome in pairs)
+        return all(mode.expects(self.row, outcome.verdict) for mode, outcome in pairs)
 
 
 @dataclass(frozen=True)
@@ -230,8 +245,8 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
         scene, report = convert_with_report(case.mesh, modes[0].options)
     except Exception as error:  # a crash is what the table is there to find
         return [_refused(error)] * len(modes)
-    judge = CaseJudge(case, scene, report)
-    outcomes, first = [], None
+    outcomes: list[Outcome] = []
+    done: dict[TriangleTest, tuple[Mode, Hits, Outcome]] = {}
     for mode in modes:
         try:
             traced = tracer(scene, mode)
@@ -240,11 +255,15 @@ def _run_case(case: Case, modes: Sequence[Mode], tracer: MakeTracer) -> list[Out
         except Exception as error:  # a crash is what the table is there to find
             outcomes.append(_refused(error))
             continue
-        outcome = outcomes[0] if first is not None and _equal(first, hits) else judge.outcome(hits)
+        first = done.get(mode.test)
+        if first is not None and _equal(first[1], hits):
+            outcome = first[2]
+        else:
+            outcome = CaseJudge(case, scene, report, mode.test).outcome(hits)
         if first is None:
-            first = hits
-        elif not _equal(first, hits):
-            outcome = replace(outcome, verdict=VIOLATED, detail=f"other hits than {modes[0].name}")
+            done[mode.test] = mode, hits, outcome
+        elif not _equal(first[1], hits):
+            outcome = replace(outcome, verdict=VIOLATED, detail=f"other hits than {first[0].name}")
         if (hit != hits.hit).any():
             outcome = replace(outcome, verdict=VIOLATED, detail="any hits are not closest hits")
         outcomes.append(outcome)
@@ -271,10 +290,12 @@ class CaseJudge:
         case: The source and the rays.
         scene: What was traced.
         report: Of its conversion.
+        test: What triangles were tested by.
     """
 
-    def __init__(self, case: Case, scene: Scene, report: Report) -> None:
+    def __init__(self, case: Case, scene: Scene, report: Report, test: TriangleTest = "watertight") -> None:
         self.case, self.scene, self.report = case, scene, report
+        self.test: TriangleTest = test
         self.scale = _power_below(np.abs([scene.low, scene.high]).max())
         positions = np.asarray(case.mesh.positions, np.float64)
         positions = positions if scene.origin is None else positions - scene.origin
@@ -332,6 +353,12 @@ class CaseJudge:
         weights = np.stack([1.0 - hits.u[at] - hits.v[at], hits.u[at], hits.v[at]], axis=1)
         points = (weights[:, :, None] * self.source.positions[self.source.faces[hits.face[at]]]).sum(axis=1)
         meant = shear_points(frames, ended, points[:, None])[:, 0, 2] / frames.depth[ended]
+        if self.test == "float64":
+            # Its t is closer than u and v, rounded to float32, can say.
+            corners = self.source.positions[self.source.faces[hits.face[at]]]
+            pairs = judge_pairs(frames, ended, corners, self.bound, self.test)
+            near = np.abs(meant - pairs.t) * np.abs(frames.depth[ended]) <= pairs.lateral + pairs.depth_error
+            meant = np.where(near, pairs.t, meant)
         unit = self.length[ended] / self.scale
         above = (hits.t[at] >= LARGEST) & ((meant >= t * (1 - 1e-6)) | (unit >= 2.0**128))
         below = (hits.t[at] <= LEAST_NORMAL) & ((meant <= t * (1 + 1e-6)) | (unit < LEAST_NORMAL))
@@ -380,11 +407,12 @@ class CaseJudge:
         pairs = self._judge.oracle.judge(frames, ray, hits.face[ray])
         corners = self._judge.oracle.positions[self.source.faces[hits.face[ray]]]
         exactly, flaw = _compare_exactly(frames, ray, corners, hits, pairs.t_bound)
-        flaw = flaw or self._contradiction(frames)
-        if result.disagreements or result.leaks or result.flaws:
+        flaw = flaw or self._contradiction(frames) or self._denied(frames, ray, corners, hits)
+        leaks = self.test == "fast" and result.leaks > 0 and not result.disagreements
+        if (result.disagreements or result.leaks or result.flaws) and not leaks:
             flaw = result.flaws[0] if result.flaws else "a disagreement"
         return Outcome(
-            VIOLATED if flaw else KEPT,
+            VIOLATED if flaw else LEAKS if leaks else KEPT,
             max(result.max_t_ratio, exactly),
             result.max_uv_ratio,
             box_need=self._box_need(frames, ray, hits),
@@ -396,7 +424,7 @@ class CaseJudge:
         assert remap is not None
         there = np.unique(remap.face)
         surface = Surface(self.source.positions.astype(np.float32), self.source.faces[there])
-        return Judge(Oracle(self.source, self.bound), surface, there.astype(np.int32), self.scene)
+        return Judge(Oracle(self.source, self.bound, self.test), surface, there.astype(np.int32), self.scene)
 
     def _contradiction(self, frames: RayFrames) -> str:
         """Where integers contradict what float64 calls certain or impossible of the faces near rays."""
@@ -412,6 +440,18 @@ class CaseJudge:
                 return f"ray {found.ray[k]} hits face {found.face[k]} exactly, which float64 calls impossible"
         return ""
 
+    def _denied(self, frames: RayFrames, ray: np.ndarray, corners: np.ndarray, hits: Hits) -> str:
+        """Where integers deny a hit of the test whose signs are exact, denormals apart, which are flushed."""
+        if self.test != "exact-sign":
+            return ""
+        given = self.case.origins[self.judged], self.case.directions[self.judged]
+        flushed = np.any([_denormal(a) for a in (*given, frames.origins, frames.directions)], axis=0)[ray]
+        flushed |= _denormal(corners.reshape(-1, 9))
+        for k in np.flatnonzero(~flushed)[:EXACT_PAIRS]:
+            if not exact_pair(frames.origins[ray[k]], frames.directions[ray[k]], corners[k]).inside:
+                return f"ray {ray[k]} hits face {hits.face[ray[k]]}, which integers say it misses"
+        return ""
+
     def _box_need(self, frames: RayFrames, ray: np.ndarray, hits: Hits) -> float:
         """The most that a traced box had to be wider, in 2^-24 of the largest coordinate of ray and scene."""
         if len(ray) == 0:
@@ -425,15 +465,18 @@ class CaseJudge:
         assert self.case.known is not None
         face = self.case.known.face[self.judged]
         wrong = np.flatnonzero(hits.face != face)
+        if len(wrong) and self.test == "fast":
+            return Outcome(LEAKS)
         if len(wrong):
             k = wrong[0]
             return Outcome(VIOLATED, detail=f"ray {k}: face {hits.face[k]} and not {face[k]}")
         frames = frame_rays(self.origins, self.directions)
         ray = np.flatnonzero(face >= 0)
         corners = np.asarray(self.source.positions, np.float64)[self.source.faces[face[ray]]]
-        pairs = judge_pairs(frames, ray, corners, self.bound)
+        pairs = judge_pairs(frames, ray, corners, self.bound, self.test)
         reported = compare_reported(frames, ray, hits, pairs, corners, np.ones(len(ray), bool))
         exactly, flaw = _compare_exactly(frames, ray, corners, hits, pairs.t_bound)
+        flaw = flaw or self._denied(frames, ray, corners, hits)
         if not reported.valid[ray].all():
             flaw = "a hit beyond its bound"
         _, t_ratio, _, uv_ratio = reported.extremes(np.isin(np.arange(len(face)), ray))
@@ -447,6 +490,11 @@ def _power_below(value: Any) -> Any:
     usable = np.isfinite(value) & (value > 0)
     exponent = np.frexp(np.where(usable, value, 1.0))[1] - 1
     return np.ldexp(1.0, -exponent)
+
+
+def _denormal(rows: np.ndarray) -> np.ndarray:
+    """Which rows have a number that counts as zero and is not."""
+    return ((rows != 0) & (np.abs(rows) < LEAST_NORMAL)).any(axis=1)
 
 
 def _untidy(case: Case, hits: Hits) -> str:

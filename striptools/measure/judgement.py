@@ -136,7 +136,7 @@ class Judge:
         face = hits.face[ray]
         if self.scene.remap is None:
             corners = self.scene.positions[self.scene.faces()[hits.triangle[ray]]].astype(np.float64)
-            pairs = judge_pairs(frames, ray, corners)
+            pairs = judge_pairs(frames, ray, corners, 0.0, self.oracle.test)
             known = np.ones(len(ray), bool)
         else:
             known = (face < len(self._row_of_face)) & np.isfinite(hits.t[ray])

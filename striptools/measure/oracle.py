@@ -18,6 +18,7 @@ import numpy as np
 
 from striptools.measure.bound import BEYOND_FACE, Pairs, RayFrames, frame_rays, judge_pairs, lateral_slack
 from striptools.mesh.mesh import Mesh
+from striptools.types import TriangleTest
 
 RAYS_A_WORD = 16
 VERTICES_A_CHUNK = 4096
@@ -72,10 +73,12 @@ class Oracle:
             corner are left out, faces without area are never hit.
         error_bound: How far the vertices of the traced scene may lie off the source's, in the model's unit:
             it widens what counts as possible and narrows what counts as certain.
+        test: What triangles are tested by; so does it. The exact hits are the same.
     """
 
-    def __init__(self, mesh: Mesh, error_bound: float = 0.0) -> None:
+    def __init__(self, mesh: Mesh, error_bound: float = 0.0, test: TriangleTest = "watertight") -> None:
         self.error_bound = float(error_bound)
+        self.test: TriangleTest = test
         self.positions = source_corners(mesh)
         finite = np.all(np.isfinite(self.positions), axis=1)
         self._finite_face = np.flatnonzero(np.all(finite[mesh.faces], axis=1)).astype(np.int32)
@@ -115,7 +118,7 @@ class Oracle:
 
     def judge(self, frames: RayFrames, ray: np.ndarray, face: np.ndarray) -> Pairs:
         """What pairs of a ray and a face of the source say; (k,) and (k,)."""
-        return judge_pairs(frames, ray, self.positions[self.faces[face]], self.error_bound)
+        return judge_pairs(frames, ray, self.positions[self.faces[face]], self.error_bound, self.test)
 
     def _judge(self, frames: RayFrames, ray: np.ndarray, face: np.ndarray) -> Candidates:
         pairs = self.judge(frames, ray, face)

@@ -4,14 +4,13 @@ There is one precision of stored boxes (8 bits a plane on the scene's grid, SPEC
 whether those inside blocks are stored or rebuilt, and that is the factor here and in the pair with residency.
 """
 
-import inspect
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from striptools.hierarchies.options import HierarchyName, HierarchyOptions
 from striptools.pipeline import Options
 from striptools.reducem.quantize import PrecisionOptions
-from striptools.trace import Tracer
+from striptools.types import TriangleTest
 
 BASELINE = "default"
 
@@ -24,6 +23,8 @@ QUICK_BITS = (20, 16, 12, 8)
 QUICK_SHARES = (0.25, 0.05)
 QUICK_LENGTHS = (8, 32)
 QUICK_BLOCKS = (64,)
+
+TESTS: tuple[TriangleTest, ...] = ("fast", "exact-sign", "float64")
 
 PAIR_BITS, PAIR_SHARES = (16, 12), (0.25, 0.05)
 
@@ -40,7 +41,7 @@ class Setting:
         options: Of the conversion.
         keep: The share of the triangles that simplification keeps.
         resident: How the tracer keeps the scene.
-        test: The tracer's triangle test; None for its default one.
+        test: The tracer's triangle test.
     """
 
     factor: str
@@ -48,7 +49,7 @@ class Setting:
     options: Options
     keep: float = 1.0
     resident: Residency = "expanded"
-    test: str | None = None
+    test: TriangleTest = "watertight"
 
     @property
     def name(self) -> str:
@@ -87,7 +88,7 @@ def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
         Setting("boxes", "stored", stored),
         Setting("residency", "compressed", base, resident="compressed"),
     ]
-    found += [Setting("triangle test", test, base, test=test) for test in triangle_tests()]
+    found += [Setting("triangle test", test, base, test=test) for test in TESTS]
     found += [
         Setting("precision x simplification", f"{b} bits, {share:.0%}", _on_grid(base, b), keep=share)
         for b in PAIR_BITS
@@ -96,16 +97,6 @@ def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
     ]
     found.append(Setting("residency x boxes", "compressed, stored", stored, resident="compressed"))
     return tuple(found)
-
-
-def triangle_tests() -> tuple[str, ...]:
-    """The triangle tests that a tracer may be asked for, but for its default one."""
-    parameter = inspect.signature(Tracer).parameters.get("test")
-    return (
-        ()
-        if parameter is None
-        else tuple(t for t in get_args(parameter.annotation) if t != parameter.default)
-    )
 
 
 def _on_grid(base: Options, bits: int) -> Options:

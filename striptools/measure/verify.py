@@ -23,6 +23,7 @@ from striptools.reducem.placed import Placed
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.trace.hit import Hits
+from striptools.types import TriangleTest
 
 
 class Traces(Protocol):
@@ -182,6 +183,7 @@ def verify(
     *,
     tracer: Traces | None = None,
     watch: Watch | None = None,
+    test: TriangleTest = "watertight",
 ) -> VerifyReport:
     """Trace a scene and prove the answers against its source.
 
@@ -192,6 +194,7 @@ def verify(
         options: How much is traced.
         tracer: What traces the scene; a `striptools.trace.Tracer` of it when None.
         watch: Called with "structure" or "rays" and the fraction done.
+        test: What `tracer` tests triangles by: each has a bound of its own. `fast` leaks.
 
     Raises:
         UsageError: The source has another number of faces than the one that the scene was made from.
@@ -204,14 +207,14 @@ def verify(
     tell = watch or (lambda stage, fraction: None)
     tell("structure", 0.0)
     structure = compare_structure(placed, source, kept)
-    oracle = Oracle(source, placed.error_bound)
+    oracle = Oracle(source, placed.error_bound, test)
     surface_face = traced_faces(placed, source, kept)
     surface = Surface(rounded_positions(source), source.faces[surface_face])
     tell("structure", 1.0)
     if tracer is None:
         from striptools.trace import Tracer
 
-        tracer = Tracer(scene, instances="flattened")
+        tracer = Tracer(scene, instances="flattened", test=test)
     judge = Judge(oracle, surface, surface_face, placed)
     tried = min(options.rays, options.pair_budget // (4 * max(1, source.triangle_count)))
     runner = _Runner(judge, tracer, tell, 4 * tried)

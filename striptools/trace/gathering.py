@@ -7,7 +7,7 @@ from jaxtyping import Int32
 
 from striptools.errors import StriptoolsError, UsageError
 from striptools.trace.hit import AllHits
-from striptools.trace.layout import Layout, Rays
+from striptools.trace.layout import Found, Rays
 from striptools.trace.walk import MISS, STUCK
 from striptools.trace.walk_gather import GatherKind
 
@@ -20,9 +20,12 @@ Parts = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
 Stream = Callable[[Rays, GatherKind, int], Parts]
 """Traces rays and gathers: the kind, and how many hits of each at most."""
 
+Weigh = Callable[[Rays, np.ndarray, tuple[np.ndarray, ...], Found], None]
+"""Fills in what was found of some rays: `Layout.weigh`."""
 
-def all_hits(stream: Stream, layout: Layout | None, rays: Rays, k: int) -> AllHits:
-    """The first k hits of each ray; no layout where the scene is empty.
+
+def all_hits(stream: Stream, weigh: Weigh, rays: Rays, k: int) -> AllHits:
+    """The first k hits of each ray.
 
     Raises:
         UsageError: K is no number of hits.
@@ -36,12 +39,11 @@ def all_hits(stream: Stream, layout: Layout | None, rays: Rays, k: int) -> AllHi
     # A program is compiled for a power of two, of which a ray's first k hits are the first k.
     for at, traced in stream(rays, "all", 1 << (k - 1).bit_length()):
         check_ended(traced[1])
-        assert layout is not None
         for j in range(k):
             nth = (np.ascontiguousarray(traced[0][:, j]), np.ascontiguousarray(traced[1][:, j]))
             if not (nth[1] >= 0).any():
                 break
-            layout.weigh(rays, at, nth, (t[j], face[j], u[j], v[j], triangle[j]))
+            weigh(rays, at, nth, (t[j], face[j], u[j], v[j], triangle[j]))
     t, face, u, v, triangle = (np.ascontiguousarray(a.T) for a in (t, face, u, v, triangle))
     return AllHits(t, face, u, v, triangle, (face >= 0).sum(axis=1, dtype=np.int32))
 

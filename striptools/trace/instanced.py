@@ -153,6 +153,10 @@ class InstancedLayout:
         above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A name alone does not tell the instance."""
+        return self.named(names)[:2]
+
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A name alone does not tell the instance."""
         raise UsageError(

@@ -12,10 +12,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
-from striptools.kernels.rays import ROW, ready_rays
+from striptools.kernels.rays import ROW, add_ways, ready_rays
 from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import aligned_full
+from striptools.trace.triangle_tests import wants_way
 from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
 from striptools.trace.walk_packets import PacketScene
 
@@ -162,7 +163,8 @@ def stream_ready(
         Which rays these are, int32, -1 for none, and their results.
     """
     count = len(rays[0])
-    single = _Pipe(scene, mesh, options, TILES, (count, ROW), ())
+    words = ROW + 3 * wants_way(options.test)
+    single = _Pipe(scene, mesh, options, TILES, (count, words), ())
     if not packets:
         yield from _send_each(single, layout, rays, EVERY_RAY, dropped)
         yield from single.drain()
@@ -192,6 +194,8 @@ def _send_each(
     while begin < count:
         rows, at = pipe.room()
         live, begin = ready_rays(*rays, which, begin, *seen, True, rows, rows.view(np.int32), at, dropped)
+        if rows.shape[1] > ROW:
+            add_ways(rays[1], at[:live], rows, rows.view(np.int32))
         yield from pipe.fill(live)
 
 

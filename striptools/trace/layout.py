@@ -82,6 +82,13 @@ class Layout(Protocol):
         """Fill in what was found of the rays `at`."""
         ...
 
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of what a walk names, (k, 3, 3) float32, scaled, in the order of the tests; and turns.
+
+        A row an axis, a column a corner; corner j is the reported face's (j + turn) % 3.
+        """
+        ...
+
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles (k,) of what a walk names, and turns: corner j is the face's (j + turn) % 3."""
         ...

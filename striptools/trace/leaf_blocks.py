@@ -7,11 +7,12 @@ to them.
 import jax.numpy as jnp
 from jax import Array, lax
 
-from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of
-from striptools.trace.walk import NO_NAME, WIDTH, Best, replaced
+from striptools.trace.triangle import Corners, Shear
+from striptools.trace.walk import NO_NAME, WIDTH, Best, Leaf, replaced
+from striptools.types import TriangleTest
 
 
-def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
+def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: TriangleTest) -> Best:
     """Test the triangles of a block, each lane against its own closest hit.
 
     Args:
@@ -19,12 +20,17 @@ def test_block(blocks: Array, block: Array, shear: Shear, best: Best) -> Best:
         block: () uint32, which of them.
         shear: Of the ray.
         best: What was found so far.
+        test: Of triangles.
     """
-    x, y, z = corners_in(blocks, block, shear.axes)
-    t = crossing_of(edges_of(x, y, z, shear))
-    face = faces_in(blocks, block)
-    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (face < best.name)))
-    return replaced(best, closer, t, face)
+    leaf = leaf_in(blocks, block, shear.axes)
+    t = leaf.crossings(shear, test=test, again=lambda: leaf_in(blocks, block, shear.axes))
+    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (leaf.name < best.name)))
+    return replaced(best, closer, t, leaf.name)
+
+
+def leaf_in(blocks: Array, block: Array, axes: tuple[Array, Array, Array]) -> Leaf:
+    """The triangles of a block, their corners along these axes."""
+    return Leaf(*corners_in(blocks, block, axes), None, None, faces_in(blocks, block))
 
 
 def corners_in(

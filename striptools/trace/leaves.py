@@ -12,6 +12,7 @@ from striptools.hierarchies.packed import wide_tree
 from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.weighing import weigh_hits
+from striptools.kernels.weighing_double import block_corners
 from striptools.kernels.wide import fill_leaf_blocks
 from striptools.partition.object_split import split_objects
 from striptools.reducem.resident import size_class
@@ -45,6 +46,12 @@ class LeafBlocks:
     triangle_of: Int32[np.ndarray, " f"]
     scale: np.float32
 
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`."""
+        corners, turns = np.zeros((len(names), 3, 3), np.float32), np.zeros(len(names), np.int32)
+        block_corners(names, self.place, self.blocks, corners, turns)
+        return corners, turns
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         given = (at, traced[0], traced[1], self.place, self.blocks, self.scale, self.triangle_of)
@@ -74,6 +81,10 @@ class ExpandedLayout:
         """Bytes of all arrays."""
         kept = _arrays_in(self.arrays)
         return sum(a.nbytes for a in kept) + self.leaves.place.nbytes + self.leaves.triangle_of.nbytes
+
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`."""
+        return self.leaves.corners_of(names)
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of its leaves are turned."""

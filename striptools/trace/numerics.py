@@ -88,6 +88,11 @@ BY_XLA = Arithmetic(
 )
 
 
+def sign_of(a: Array) -> Array:
+    """Int32: the top bit where a number is negative, or -0.0, else zero."""
+    return lax.bitcast_convert_type(a, jnp.int32) & SIGN
+
+
 def with_sign_of(a: Array, sign_bit: Array) -> Array:
     """Flip the sign of `a` where `sign_bit` (int32, the top bit or zero) is set."""
     return lax.bitcast_convert_type(lax.bitcast_convert_type(a, jnp.int32) ^ sign_bit, jnp.float32)

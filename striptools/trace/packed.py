@@ -9,6 +9,7 @@ import numpy as np
 from striptools.errors import LimitError
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
+from striptools.kernels.weighing_double import packed_corners
 from striptools.trace.counters import Counters
 from striptools.trace.layout import Found, PacketView, Rays, packet_view
 from striptools.trace.leaves import aligned_zeros, reach_of, scale_of, size_class
@@ -88,6 +89,14 @@ class PackedLayout:
         arrays = self.arrays
         held = (arrays.nodes, arrays.headers, arrays.words, arrays.first_run, arrays.runs, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
+
+    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`."""
+        arrays = self.arrays
+        corners, turns = np.zeros((len(names), 3, 3), np.float32), np.zeros(len(names), np.int32)
+        given = (names, arrays.headers[: self.blocks], arrays.words, self.rotations)
+        packed_corners(*given, int(arrays.scale_exponent), corners, turns)
+        return corners, turns
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of the file's are turned."""

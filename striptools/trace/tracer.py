@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -29,6 +29,8 @@ from striptools.trace.walk_gather import GatherKind
 from striptools.trace.walk_packed import PackedScene
 from striptools.trace.walk_points import PointOptions
 from striptools.trace.walk_wide import WideScene
+from striptools.trace.weighing import weigh_in_double, weights_inside
+from striptools.types import TriangleTest
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
@@ -85,9 +87,15 @@ class Tracer:
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
             geometry once, for closest hits and any hits. "auto" flattens what fits in `memory_budget`, and
             shares where it does not or where `resident` is compressed.
+        test: How a ray and a triangle are tested (`trace.triangle_tests`; bounds in `measure.bound`):
+            "watertight" lets no ray slip through a closed surface, and counts as hit what is as near to it as
+            float32 rounds; "fast" is Moeller and Trumbore's, which leaks; "exact-sign" hits exactly what
+            exact arithmetic would, edges and corners included, t as of "watertight"; "float64" tests in
+            float64, and rounds t, u and v to float32 last. Tests other than the default one go through
+            wide nodes only, without packets and without a kernel; `contains` asks the default one.
 
     Raises:
-        UsageError: There is no such device, hierarchy or residency, or not both of them together; or
+        UsageError: There is no such device, hierarchy, residency or test, or not both of them together; or
             instances are to be shared of which one is too distorted for float32.
         LimitError: All instances have more triangles than a mesh may have, or, shared, than int32 can number;
             or the scene has no coordinate of 2**-126 or more.
@@ -103,8 +111,11 @@ class Tracer:
         resident: ResidentKind = "auto",
         memory_budget: int | None = None,
         instances: InstancesKind = "auto",
+        test: TriangleTest = "watertight",
     ) -> None:
         _check_kinds(hierarchy, resident, instances)
+        _check_test(test)
+        self._test: TriangleTest = test
         devices = self._choose(device, threads)
         self._origin = np.zeros(3) if scene.origin is None else np.array(scene.origin, np.float64)
         budget = free_memory(devices[0]) // 4 if memory_budget is None else memory_budget
@@ -121,6 +132,8 @@ class Tracer:
         self._numbers = None if scene.instances is None else InstanceNumbers.of(scene)
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
+            if test != "watertight":
+                self._need_wide_nodes(f"triangle test {test} does not")
 
     @classmethod
     def of_layout(
@@ -132,6 +145,7 @@ class Tracer:
         tracer._origin = np.zeros(3)
         tracer._resident, tracer._empty = "expanded", False
         tracer._shared, tracer._numbers = False, None
+        tracer._test = "watertight"
         tracer._take(layout)
         return tracer
 
@@ -205,7 +219,7 @@ class Tracer:
             t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
             counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
             packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side:
-                those of a camera or towards a light. Hits are the same.
+                those of a camera or towards a light. Hits are the same. Not of other tests than the default.
 
         Raises:
             UsageError: The arrays are not of these shapes, or not numbers.
@@ -236,9 +250,17 @@ class Tracer:
         def weigh(part: tuple[int, int]) -> None:
             mine = slice(*part)
             mine_traced = tuple(a[mine] if len(a) == len(at) else a for a in traced)
-            self._layout.weigh(rays, at[mine], mine_traced, found)
+            self._weighed(rays, at[mine], mine_traced, found)
 
         in_chunks(weigh, len(at), self._weighers)
+
+    def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`, weights by the precision of the test."""
+        self._layout.weigh(rays, at, traced, found)
+        if self._test == "fast":
+            weights_inside(at, found)
+        elif self._test != "watertight":
+            weigh_in_double(self._layout, rays, at, traced[1], found)
 
     def _stream(
         self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
@@ -253,7 +275,8 @@ class Tracer:
             return
         if not options.batch:
             given = (self._scene, self._layout, rays, dropped, self._mesh, options)
-            in_packets = packets and not options.counting and self._layout.seen_by_packets is not None
+            plain = not options.counting and options.test == "watertight"
+            in_packets = packets and plain and self._layout.seen_by_packets is not None
             yield from stream_ready(*given, in_packets)
             return
         for part, traced in stream(self._scene, rays, self._mesh, options):
@@ -294,8 +317,7 @@ class Tracer:
             UsageError: As for `closest_hit`, or k is out of range.
             StriptoolsError: As for `closest_hit`.
         """
-        layout = None if self._empty else self._layout
-        return all_hits(self._gather, layout, checked_rays(origins, directions, t_max), k)
+        return all_hits(self._gather, self._weighed, checked_rays(origins, directions, t_max), k)
 
     def count_hits(
         self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
@@ -395,17 +417,17 @@ class Tracer:
         with quiet_jax():
             return jax.device_put(self._layout.arrays, self.devices[0]), options
 
-    def _need_wide_nodes(self) -> None:
+    def _need_wide_nodes(self, refused: str = "only closest hits and any hits") -> None:
         """Refuse what only the walk of wide nodes can do."""
         if self._shared:
             raise UsageError(
-                "only closest hits and any hits go through shared instances",
+                f"{refused} go through shared instances",
                 where="instances",
                 remedy="use instances flattened",
             )
         if not isinstance(self._layout.arrays, WideScene | PackedScene):
             raise UsageError(
-                "only closest hits and any hits go through this hierarchy",
+                f"{refused} go through this hierarchy",
                 where="hierarchy",
                 remedy="use hierarchy rebuilt",
             )
@@ -432,8 +454,9 @@ class Tracer:
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
         plain = not counting and gather is None
+        plain = plain and self._test == "watertight"
         kernel = self._kernel and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
-        given = (self._stack_size, self._on_gpu, decode, gather, most, kernel)
+        given = (self._stack_size, self._on_gpu, decode, gather, most, self._test, kernel)
         return WalkOptions(side_by_side, any_hit, counting, *given)
 
 
@@ -447,6 +470,13 @@ def _check_kinds(hierarchy: str, resident: str, instances: str) -> None:
     if hierarchy == "rebuilt" and resident == "compressed":
         raise UsageError(
             "a rebuilt hierarchy is expanded", where="resident", remedy="use the stored hierarchy"
+        )
+
+
+def _check_test(test: str) -> None:
+    if test not in get_args(TriangleTest):
+        raise UsageError(
+            f"no such triangle test: {test!r}", remedy=f"use {', '.join(get_args(TriangleTest))}"
         )
 
 

@@ -28,15 +28,15 @@ Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from striptools.trace.numerics import (
     BY_XLA,
-    SIGN,
     Arithmetic,
     larger,
     quotient,
     rounded,
+    sign_of,
     smaller,
     with_sign_of,
 )
@@ -46,13 +46,17 @@ Corners = tuple[Array, Array, Array]
 
 
 class Shear(NamedTuple):
-    """A ray as the test sees it: axes (z dominant), origin along them, and the shear that sets it upright."""
+    """A ray as the test sees it: axes (z dominant), origin along them, and the shear that sets it upright.
+
+    `way` is its direction along the axes, unrounded, where a test asks for it (`triangle_tests.wants_way`).
+    """
 
     axes: tuple[Array, Array, Array]
     origin: tuple[Array, Array, Array]
     x: Array
     y: Array
     z: Array
+    way: tuple[Array, Array, Array] | None = None
 
 
 class Edges(NamedTuple):
@@ -95,9 +99,7 @@ def pick(vector: Array | tuple[Array, Array, Array], axis: Array) -> Array:
 def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Edges:
     """Edge functions of one triangle or of a block of them, its coordinates along the axes of the shear."""
     product = arithmetic.product
-    heights = [at - shear.origin[2] for at in z]
-    ax, bx, cx = (at - shear.origin[0] - product(shear.x, h) for at, h in zip(x, heights, strict=True))
-    ay, by, cy = (at - shear.origin[1] - product(shear.y, h) for at, h in zip(y, heights, strict=True))
+    (ax, bx, cx), (ay, by, cy), heights = sheared(x, y, z, shear, arithmetic)
     a, b, c = (product(h, shear.z) for h in heights)
     return Edges(
         product(cx, by) - product(cy, bx),
@@ -107,6 +109,17 @@ def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear, arithmetic: Arith
         _straddle(ax, bx, cx, arithmetic) & _straddle(ay, by, cy, arithmetic),
         (ay, by, cy),
     )
+
+
+def sheared(
+    x: Corners, y: Corners, z: Corners, shear: Shear, arithmetic: Arithmetic = BY_XLA
+) -> tuple[Corners, Corners, Corners]:
+    """Corners as a ray sees them that is upright in 0, and how far along its axis they are."""
+    product = arithmetic.product
+    heights = [at - shear.origin[2] for at in z]
+    ax, bx, cx = (at - shear.origin[0] - product(shear.x, h) for at, h in zip(x, heights, strict=True))
+    ay, by, cy = (at - shear.origin[1] - product(shear.y, h) for at, h in zip(y, heights, strict=True))
+    return (ax, bx, cx), (ay, by, cy), (heights[0], heights[1], heights[2])
 
 
 def _straddle(a: Array, b: Array, c: Array, arithmetic: Arithmetic) -> Array:
@@ -130,7 +143,7 @@ def crossing_of(edges: Edges, turn: Array | None = None, arithmetic: Arithmetic 
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     determinant = _summed(a, b, c, turn)
     scaled_t = _summed(product(a, heights[0]), product(b, heights[1]), product(c, heights[2]), turn)
-    sign = lax.bitcast_convert_type(determinant, jnp.int32) & SIGN
+    sign = sign_of(determinant)
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
     return arithmetic.settled(arithmetic.quotient(scaled_t, with_sign_of(determinant, sign)))
 

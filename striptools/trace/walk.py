@@ -45,12 +45,17 @@ from striptools.trace.numerics import (
     quotient,
     smaller,
 )
-from striptools.trace.triangle import Corners, Shear, crossing_of, edges_of, shear_of
+from striptools.trace.triangle import Corners, Shear, pick, shear_of
+from striptools.trace.triangle_tests import Triangles, crossings_by, wants_way
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
+from striptools.types import TriangleTest
 
 WIDTH = 8
 FLOATS = 17
 """Float32 words at the head of a ready ray; int32 words follow."""
+
+WORDS = 24
+"""Words of a ready ray; three float32 of its direction follow, where a triangle test asks for them."""
 
 START = 4
 """Where among the int32 words a ray's first child is."""
@@ -116,10 +121,29 @@ class Leaf(NamedTuple):
     filled: Array | None
     name: Array
 
-    def crossings(self, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Array:
-        """(8,) float32: t at which the ray goes through each triangle; positive and finite only there."""
-        t = crossing_of(edges_of(self.x, self.y, self.z, shear, arithmetic), self.turn, arithmetic)
+    def crossings(
+        self,
+        shear: Shear,
+        arithmetic: Arithmetic = BY_XLA,
+        test: TriangleTest = "watertight",
+        again: "Callable[[], Leaf] | None" = None,
+    ) -> Array:
+        """(8,) float32: t at which the ray goes through each triangle; positive and finite only there.
+
+        Args:
+            shear: Of the ray.
+            arithmetic: Of the compiler at hand.
+            test: Of triangles.
+            again: Makes the same leaf: for what is rarely computed, so that nothing is kept for it.
+        """
+        again = again or (lambda: self)
+        t = crossings_by(test, self.triangles, shear, arithmetic, lambda: again().triangles)
         return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
+
+    @property
+    def triangles(self) -> Triangles:
+        """What a test is told."""
+        return Triangles(self.x, self.y, self.z, self.turn, self.filled)
 
 
 class WalkScene(Protocol):
@@ -192,6 +216,7 @@ class WalkOptions(NamedTuple):
         decode: How leaves are decoded, where they are packed.
         gather: What to gather in the place of the closest hit, if anything.
         most: How many hits to gather, where all are.
+        test: The test of triangles.
         kernel: Walk by the kernel of `trace.pallas`, whose twin `batch` is; nothing is counted or gathered.
     """
 
@@ -203,6 +228,7 @@ class WalkOptions(NamedTuple):
     decode: "Decode | None" = None
     gather: GatherKind | None = None
     most: int = 0
+    test: TriangleTest = "watertight"
     kernel: bool = False
 
 
@@ -244,7 +270,7 @@ class ReadyRay(NamedTuple):
     """What stays the same all along a walk, in as few arrays as can be: a loop pays for each.
 
     Attributes:
-        floats: (17,) float32: what the properties name.
+        floats: (17,) float32: what the properties name; (20,) where the direction follows.
         ints: (7,) int32: axes of the shear, mirror, and where the walk starts: exclusive-or of `DONE` and
             the child to visit first (zeros are a ray that is done), the root's lanes left, nodes visited.
         lane_bits: (8,) int32, the bit that stands for each lane, the nearest highest.
@@ -264,7 +290,10 @@ class ReadyRay(NamedTuple):
         """The ray as the triangle test sees it."""
         x, y, z = (index(self.ints[k]) for k in range(3))
         origin = (self.floats[9], self.floats[10], self.floats[11])
-        return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14])
+        way = None
+        if len(self.floats) > FLOATS:
+            way = (self.floats[FLOATS], self.floats[FLOATS + 1], self.floats[FLOATS + 2])
+        return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14], way)
 
     @property
     def t_max(self) -> Array:
@@ -326,13 +355,27 @@ def trace_rays(
         t_max: (r,) float32.
         options: What to compile in.
     """
-    return scene.walk_rays(prepared_rays(scene, origins, directions, t_max), options)
+    return scene.walk_rays(prepared_rays(scene, origins, directions, t_max, options.test), options)
 
 
-def prepared_rays(scene: WalkScene, origins: Array, directions: Array, t_max: Array) -> Array:
-    """Ready rays for the walk: (r, 24) float32, the floats and the bits of the ints of `ReadyRay`."""
+def prepared_rays(
+    scene: WalkScene, origins: Array, directions: Array, t_max: Array, test: TriangleTest = "watertight"
+) -> Array:
+    """Ready rays for the walk: (r, 24) float32, the floats and the bits of the ints of `ReadyRay`.
+
+    (r, 27) for a test that asks for the direction along the axes of the shear.
+    """
     floats, ints = jax.vmap(lambda *ray: _prepare(scene, *ray))(origins, directions, t_max)
-    return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)], axis=1)
+    rows = [floats, lax.bitcast_convert_type(ints, jnp.float32)]
+    if wants_way(test):
+        rows.append(jax.vmap(_way_of)(directions, ints))
+    return jnp.concatenate(rows, axis=1)
+
+
+def _way_of(direction: Array, ints: Array) -> Array:
+    """(3,) float32: a direction scaled, along the axes of its shear."""
+    scaled = direction * power_of_two_below(largest_of(direction))[0]
+    return jnp.stack([pick(scaled, ints[axis]) for axis in range(3)])
 
 
 def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
@@ -340,7 +383,7 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
 
     Args:
         scene: What to trace.
-        ready: (r, 24) float32, as from `prepared_rays`; rows of zeros are rays that end at once.
+        ready: (r, 24) or (r, 27) float32, as from `prepared_rays`; rows of zeros are rays that end at once.
         options: What to compile in.
     """
     rows = ready.reshape(len(ready) // options.interleave, options.interleave, -1)
@@ -376,8 +419,11 @@ def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root
 
 def ready_ray(row: Array) -> ReadyRay:
     """The ray that a row says."""
-    ints = lax.bitcast_convert_type(row[FLOATS:], jnp.int32)
-    return ReadyRay(row[:FLOATS], ints, jnp.int32(1) << (jnp.arange(WIDTH, dtype=jnp.int32) ^ ints[3]))
+    ints = lax.bitcast_convert_type(row[FLOATS:WORDS], jnp.int32)
+    floats = row[:FLOATS]
+    if len(row) > WORDS:
+        floats = jnp.concatenate([floats, row[WORDS:]])
+    return ReadyRay(floats, ints, jnp.int32(1) << (jnp.arange(WIDTH, dtype=jnp.int32) ^ ints[3]))
 
 
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:

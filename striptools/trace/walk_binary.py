@@ -31,6 +31,22 @@ from striptools.trace.walk_single import (
 NODE_BYTES = 64
 
 
+class _Place(NamedTuple):
+    """Where a ray is.
+
+    Attributes:
+        child: The node or leaf to visit, `DONE` where the next one waits on the stack.
+        height: Entries of the stack.
+        stack: (k, 2) float32: the bits of what waits, and where the ray enters it.
+        turns: Nodes visited.
+    """
+
+    child: Array
+    height: Array
+    stack: Array
+    turns: Array
+
+
 class BinaryScene(NamedTuple):
     """A scene under a binary hierarchy.
 
@@ -48,24 +64,7 @@ class BinaryScene(NamedTuple):
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
-        stack = jnp.zeros((options.stack_size, 2), jnp.float32)
-        return walk_each(ready, options, lambda ray, stack: _walk(self, ray, stack, options), stack)
-
-
-class _Place(NamedTuple):
-    """Where a ray is.
-
-    Attributes:
-        child: The node or leaf to visit, `DONE` where the next one waits on the stack.
-        height: Entries of the stack.
-        stack: (k, 2) float32: the bits of what waits, and where the ray enters it.
-        turns: Nodes visited.
-    """
-
-    child: Array
-    height: Array
-    stack: Array
-    turns: Array
+        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 2), jnp.float32))
 
 
 def _walk(scene: BinaryScene, ray: ReadyRay, stack: Array, options: WalkOptions) -> tuple[Array, Ended]:

@@ -58,7 +58,7 @@ def gather_leaf(
     leaf = scene.leaf_of(shear.axes, child, options.decode)
     if options.gather == "windings":
         return _counted(so_far, _windings(leaf, shear))
-    t = leaf.crossings(shear)
+    t = leaf.crossings(shear, test=options.test)
     if options.gather == "count":
         return _counted(so_far, jnp.where((t > 0) & (t < t_max), jnp.int32(1), jnp.int32(0)))
     met = (t > 0) & (t <= so_far.nearest)

@@ -202,15 +202,7 @@ def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]
 def trace_instances(
     scene: InstancedScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
 ) -> InstancesTraced:
-    """Trace r rays.
-
-    Args:
-        scene: What to trace.
-        origins: (r, 3) float32.
-        directions: (r, 3) float32.
-        t_max: (r,) float32.
-        options: What to compile in; rays go one by one, or all at once (`batch`).
-    """
+    """Trace r rays, one by one or all at once; arguments are those of `walk.trace_rays`."""
     options = options._replace(interleave=1)
 
     def walk(*ray: Array) -> InstancesTraced:

@@ -128,8 +128,7 @@ class KdScene(NamedTuple):
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
-        stack = jnp.zeros((options.stack_size, 3), jnp.int32)
-        return walk_each(ready, options, lambda ray, stack: _walk(self, ray, stack, options), stack)
+        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
 
 
 class _Place(NamedTuple):

@@ -212,8 +212,12 @@ class PackedScene(NamedTuple):
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, each lane against its own closest hit."""
-        leaf = self.leaf_of(shear.axes, child, options.decode)
-        t = leaf.crossings(shear)
+
+        def decoded() -> Leaf:
+            return self.leaf_of(shear.axes, child, options.decode)
+
+        leaf = decoded()
+        t = leaf.crossings(shear, test=options.test, again=decoded)
         found = _any((t > 0) & (t <= best.t))
         return lax.cond(found, lambda: self._merged(best, t, leaf.name, options.any_hit), lambda: best)
 

@@ -146,12 +146,7 @@ class PresortedScene(NamedTuple):
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
-        stack = jnp.zeros((options.stack_size, 3), jnp.int32)
-
-        def walk(ray: ReadyRay, stack: Array) -> tuple[Array, Ended]:
-            return _walk(self, ray, stack, options)
-
-        return walk_each(ready, options, walk, stack)
+        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
 
 
 class DirectScene(PresortedScene):

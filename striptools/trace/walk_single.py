@@ -55,14 +55,15 @@ class Ended(NamedTuple):
     stuck: Array
 
 
-Walk = Callable[[ReadyRay, Array], tuple[Array, Ended]]
-"""A walk of a live ray and a stack to the stack as it is left and how it ended."""
+Walk = Callable[[Any, ReadyRay, Array, WalkOptions], tuple[Array, Ended]]
+"""A walk of a scene, a live ray and a stack to the stack as it is left and how it ended."""
 
 
-def walk_each(ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> Traced:
+def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> Traced:
     """Walk r rays by a function of one.
 
     Args:
+        scene: What to trace.
         ready: (r, 24) float32, as from `walk.prepared_rays`; rows of zeros are rays that end at once.
         options: What to compile in.
         walk: Of one ray. It is called for rays that are none too, of which it is told by `is_live`, and
@@ -73,7 +74,7 @@ def walk_each(ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> T
 
     def one(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         ray = ready_ray(row)
-        stack, ended = walk(ray, stack)
+        stack, ended = walk(scene, ray, stack, options)
         name = closest_name(ended.best, options.any_hit)
         t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(ended.best.nearest * ray.t_unit))
         counted = jnp.stack([jnp.asarray(each, jnp.int32) for each in ended.counters])
@@ -109,7 +110,7 @@ def test_leaf(leaves: Leaves, leaf: Array, ray: ReadyRay, best: Best) -> Best:
 
     def test(carried: tuple[Array, Best]) -> tuple[Array, Best]:
         block, best = carried
-        return block + 1, test_block(leaves.blocks, index(block), ray.shear, best)
+        return block + 1, test_block(leaves.blocks, index(block), ray.shear, best, "watertight")
 
     return lax.while_loop(lambda carried: carried[0] < end, test, (first, best))[1]
 

@@ -75,11 +75,7 @@ class SlbvhScene(NamedTuple):
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready. There is no stack."""
-
-        def walk(ray: ReadyRay, stack: Array) -> tuple[Array, Ended]:
-            return stack, _walk(self, ray, options)
-
-        return walk_each(ready, options, walk, jnp.zeros(0))
+        return walk_each(self, ready, options, _walk, jnp.zeros(0))
 
 
 def step_in(place: Place, right: Array) -> Place:
@@ -95,7 +91,7 @@ def step_out(place: Place) -> Place:
     return Place(jnp.where(trail <= 1, jnp.uint32(0), (place.node >> levels) ^ 1), trail)
 
 
-def _walk(scene: SlbvhScene, ray: ReadyRay, options: WalkOptions) -> Ended:
+def _walk(scene: SlbvhScene, ray: ReadyRay, stack: Array, options: WalkOptions) -> tuple[Array, Ended]:
     """Walk one ray: nodes until there is a leaf, then the leaf."""
     root = jnp.where(is_live(ray), jnp.uint32(1), jnp.uint32(0))
     begin = _State(Place(root, jnp.uint32(1)), scene.no_leaf, jnp.int32(0))
@@ -127,7 +123,7 @@ def _walk(scene: SlbvhScene, ray: ReadyRay, options: WalkOptions) -> Ended:
         counts = counts._replace(nodes=turns, boxes=turns, node_bytes=turns * NODE_BYTES)
     # A trail whose levels went beyond its bits is not left at 1.
     stuck = (state.place.node != 0) | (state.place.trail != 1)
-    return Ended(best, counts or no_counts(), stuck)
+    return stack, Ended(best, counts or no_counts(), stuck)
 
 
 def _visit(scene: SlbvhScene, ray: ReadyRay, state: _State, limit: Array) -> _State:

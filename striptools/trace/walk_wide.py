@@ -7,7 +7,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.leaf_blocks import corners_in, faces_in, test_block, triangles_in
+from striptools.trace.leaf_blocks import leaf_in, test_block, triangles_in
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import WIDTH, Best, Decode, Frame, Leaf, Traced, WalkOptions, walk_rays
@@ -59,12 +59,11 @@ class WideScene(NamedTuple):
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
-        return test_block(self.blocks, index(-(child + 1)), shear, best)
+        return test_block(self.blocks, index(-(child + 1)), shear, best, options.test)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
-        leaf = index(-(child + 1))
-        return Leaf(*corners_in(self.blocks, leaf, axes), None, None, faces_in(self.blocks, leaf))
+        return leaf_in(self.blocks, index(-(child + 1)), axes)
 
     def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The same: nothing is decoded."""

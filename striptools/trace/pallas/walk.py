@@ -119,7 +119,9 @@ def _ray_at(ready: Any, row: Array) -> _Ray:
     words = [plgpu.load(ready.at[row, k]) for k in range(FLOATS + 6)]
     floats, ints = words[:FLOATS], [lax.bitcast_convert_type(word, np.int32) for word in words[FLOATS:]]
     slab = Slab(floats[0:3], floats[3:6], floats[6:9])  # pyright: ignore[reportArgumentType]
-    shear = Shear((ints[0], ints[1], ints[2]), (floats[9], floats[10], floats[11]), *floats[12:15])
+    shear = Shear(
+        (ints[0], ints[1], ints[2]), (floats[9], floats[10], floats[11]), floats[12], floats[13], floats[14]
+    )
     return _Ray(slab, shear, floats[15], floats[16], ints[3], ints[4] ^ DONE, ints[5])
 
 
