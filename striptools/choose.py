@@ -29,11 +29,12 @@ from striptools.stopwatch import Watch
 Target = Literal["quality", "balanced", "small", "fast"]
 TARGETS: tuple[Target, ...] = get_args(Target)
 
-BALANCED_ERROR, SMALL_ERROR = 1e-5, 1e-4
-"""The largest errors, in diagonals, of the targets that take a grid where none is given."""
+LARGEST_ERRORS: dict[Target, float] = {"quality": 0.0, "balanced": 1e-5, "small": 1e-4, "fast": 0.0}
+"""The largest error that a target allows where none is given, in diagonals; 0 keeps every bit."""
 
 TABLE = "choose_table.json"
-BASELINE = "default"
+BASELINE, TARGET = "default", "target"
+"""Factors of a trade that stand for no choice of their own: the default, and what a target chose."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def convert_to_wish(
     """
     resident, why = "expanded", []
     if wish.target is not None:
-        options, resident, said = _for_target(options, wish.target, wish.table or shipped_table())
+        options, resident, said = for_target(options, wish.target, wish.table)
         why.append(said)
     job = partial(convert_with_report, file_format=file_format, watch=watch)
     if wish.budget is None:
@@ -159,17 +160,20 @@ def read_table(path: Path) -> tuple[Row, ...]:
 
 
 def table_of(trades: list[list[dict[str, Any]]]) -> tuple[Row, ...]:
-    """The medians of trades, for points that all of them have.
+    """The medians of trades, for points that all of them have; what targets chose is left out.
 
     Args:
         trades: The `points` of each, as `trade --format json` prints them.
     """
     by_name = [{point["name"]: point for point in points} for points in trades]
     shared = [name for name in by_name[0] if all(name in points for points in by_name)]
-    return tuple(_median_row([(points[name], points[BASELINE]) for points in by_name]) for name in shared)
+    rows = [median_row([(points[name], points[BASELINE]) for points in by_name]) for name in shared]
+    return tuple(row for row in rows if row.factor != TARGET)
 
 
-def _median_row(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> Row:
+def median_row(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> Row:
+    """A row of the medians of one point in several trades, each beside the default of its trade."""
+
     def over_default(name: str) -> float:
         return median(point[name] / default[name] for point, default in pairs)
 
@@ -181,7 +185,7 @@ def _median_row(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> Row:
     return Row(first["factor"], first["value"], *sizes, 1.0 if first["factor"] == BASELINE else speed, bound)
 
 
-def _cost(row: Row, target: Target) -> float:
+def cost_of(row: Row, target: Target) -> float:
     """What a target wants least of."""
     return {
         "quality": row.bound,
@@ -189,6 +193,11 @@ def _cost(row: Row, target: Target) -> float:
         "small": row.disk,
         "fast": 1 / row.speed,
     }[target]
+
+
+def may_choose(factor: str) -> bool:
+    """Whether a target may choose points of a factor: every triangle is kept, and no ray leaks."""
+    return "simplification" not in factor and factor not in ("triangle test", TARGET)
 
 
 NEAR = 0.05
@@ -199,23 +208,29 @@ def best_row(table: tuple[Row, ...], target: Target, largest: float) -> Row:
     """The row that a target asks for, none of a larger bound; the default where nothing is clearly better.
 
     Args:
-        table: The rows; simplified ones and pairs with them are never chosen.
+        table: The rows; simplified ones and other triangle tests, which may leak, are never chosen.
         target: What matters most.
         largest: The largest bound allowed, in diagonals.
     """
-    allowed = [row for row in table if "simplification" not in row.factor and row.factor != "triangle test"]
-    allowed = [row for row in allowed if row.bound <= largest]
-    best = min(_cost(row, target) for row in allowed)
-    near = [row for row in allowed if _cost(row, target) <= best * (1 + NEAR)]
-    return min(near, key=lambda row: (row.factor != BASELINE, _cost(row, target)))
+    allowed = [row for row in table if may_choose(row.factor) and row.bound <= largest]
+    best = min(cost_of(row, target) for row in allowed)
+    near = [row for row in allowed if cost_of(row, target) <= best * (1 + NEAR)]
+    return min(near, key=lambda row: (row.factor != BASELINE, cost_of(row, target)))
 
 
-def _for_target(options: Options, target: Target, table: tuple[Row, ...]) -> tuple[Options, Residency, str]:
-    """The options and the residency that a target asks for, and why."""
-    asked = options.precision
-    errors = {"balanced": BALANCED_ERROR, "small": SMALL_ERROR}
-    if asked.is_lossless and target in errors:
-        asked = PrecisionOptions(max_error=errors[target], relative=True)
+def for_target(
+    options: Options, target: Target, table: tuple[Row, ...] = ()
+) -> tuple[Options, Residency, str]:
+    """The options and the residency that a target asks for, and why.
+
+    Args:
+        options: What is asked for besides; its precision stands where it is not lossless.
+        target: What matters most.
+        table: Points to choose from; those of the package where it is empty.
+    """
+    asked, table = options.precision, table or shipped_table()
+    if asked.is_lossless and LARGEST_ERRORS[target] > 0:
+        asked = PrecisionOptions(max_error=LARGEST_ERRORS[target], relative=True)
     # Precision is decided by its closed form; the table decides the rest.
     row = best_row(tuple(one for one in table if one.factor != "precision"), target, 0.0)
     chosen = replace(options, precision=asked)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from striptools.choose import (
-    SMALL_ERROR,
+    LARGEST_ERRORS,
     TARGETS,
     Row,
     Wish,
@@ -91,12 +91,12 @@ def test_a_budget_that_cannot_be_kept_is_refused(part: Mesh) -> None:
 def test_small_is_within_a_tenth_of_the_best_of_a_sweep(part: Mesh) -> None:
     scene, _, choice = convert_to_wish(part, Options(), Wish(target="small"))
     diagonal = float(np.linalg.norm(part.bounds[1] - part.bounds[0]))
-    assert scene.error_bound <= SMALL_ERROR * diagonal
+    assert scene.error_bound <= LARGEST_ERRORS["small"] * diagonal
     assert "target small" in choice.why
 
     def size(options: Options) -> float:
         found = convert(part, options)
-        if found.error_bound > SMALL_ERROR * diagonal:
+        if found.error_bound > LARGEST_ERRORS["small"] * diagonal:
             return np.inf
         return sum(found.part_bytes().values())
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from striptools.choose import BASELINE
 from striptools.measure import trade as module
 from striptools.measure.plots_trade import pareto, plot_trade
 from striptools.measure.report_html import pictures_of, report_html, sentences
 from striptools.measure.trade import STATE, Point, Trade, TradeOptions, peer_distance, trade
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
-from striptools.measure.trade_points import BASELINE, Setting, settings
+from striptools.measure.trade_points import Setting, settings
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
@@ -122,7 +123,7 @@ def test_an_interrupted_trade_goes_on(
     # Other options, or a damaged file: everything again.
     for text in (json.dumps({**kept, "key": "other"}), "{"):
         (tmp_path / STATE).write_text(text)
-        assert not module._State.opened(tmp_path, state["key"]).points
+        assert not module._State.opened(tmp_path, state["key"], few(Options())).points
 
 
 def test_json_and_back(done: tuple[Trade, Path]) -> None:
@@ -147,7 +148,9 @@ def test_a_report_stands_alone(done: tuple[Trade, Path]) -> None:
 
     Reader().feed(text)
     links = [value for _, attributes in seen for name in ("src", "href") if (value := attributes.get(name))]
-    assert len(links) == 1 + len(pictures)
+    # The default's picture is that of compressed too, and in it once.
+    assert pictures["residency: compressed"] == pictures[BASELINE]
+    assert len(links) == 1 + len(set(pictures.values())) < 1 + len(pictures)
     assert all(link.startswith("data:image/png;base64,") for link in links)
     assert not any(tag == "script" for tag, _ in seen)
     assert "&lt;b&gt;&amp;" in text

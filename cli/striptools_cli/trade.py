@@ -7,7 +7,7 @@ import typer
 
 from striptools.errors import MissingExtraError
 from striptools.measure.plots_trade import plot_trade
-from striptools.measure.report_html import pictures_of, report_html, sentences
+from striptools.measure.report_html import pictures_of, report_html, sentences, target_lines
 from striptools.measure.trade import Point, Trade, TradeOptions, trade
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
@@ -54,9 +54,10 @@ def run(
     """Measure what bytes, speed and error are traded for each other, one factor at a time.
 
     Around the default: precision, simplification, strip cap, block size, hierarchy, boxes, residency, the
-    triangle test, and a few pairs. Every point is traced in turn with the default and judged against the
-    source. Boxes have one precision in this format; what can be chosen is whether those inside blocks are
-    stored or rebuilt. Needs the extras trace and, for some points, simplify; with --out plots too.
+    triangle test, a few pairs, and what the targets of convert choose. Every point is traced in turn with
+    the default and judged against the source. Boxes have one precision in this format; what can be chosen is
+    whether those inside blocks are stored or rebuilt. Needs the extras trace and, for some points, simplify;
+    with --out plots too.
     """
     log.set_up(quiet=quiet)
     folder = None if out is None else folder_for(out)
@@ -112,7 +113,8 @@ def printed(found: Trade, form: Format) -> str:
         return render_table([vars(point) for point in found.points], "csv")
     rows = [_row(point) for point in found.points]
     heading = f"{found.model}: {found.triangles:,} triangles; lengths in diagonals, rays over the default's"
-    lines = sentences(found) + [f"left out: {name}: {why}" for name, why in found.left_out.items()]
+    lines = sentences(found) + target_lines(found)
+    lines += [f"left out: {name}: {why}" for name, why in found.left_out.items()]
     return render_table(rows, form, heading) + "".join(f"\n{line}\n" for line in lines)
 
 

@@ -7,8 +7,9 @@ import base64
 import html
 from pathlib import Path
 
+from striptools.choose import BASELINE
 from striptools.measure.trade import Point, Trade, picture_name
-from striptools.measure.trade_points import BASELINE
+from striptools.measure.trade_targets import chosen_of
 
 COLUMNS = {
     "name": "point",
@@ -37,9 +38,10 @@ COLUMNS = {
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; }
 table { border-collapse: collapse; font-size: 12px; } th, td { padding: 2px 7px; text-align: right; }
-th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child { text-align: left; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child { text-align: left; white-space: nowrap; }
 tr:nth-child(even) { background: #f4f5f7; } .wide { overflow-x: auto; } img { max-width: 100%; }
-figure { display: inline-block; margin: 6px; width: 290px; } figcaption { font-size: 12px; }
+figure { display: inline-block; margin: 6px; width: 390px; vertical-align: top; }
+figcaption { font-size: 12px; }
 .bad { color: #b00020; font-weight: bold; } footer { color: #666; font-size: 12px; margin-top: 2rem; }
 """
 
@@ -59,9 +61,11 @@ def report_html(trade: Trade, plot: bytes | None, pictures: dict[str, bytes]) ->
         f"<p>{html.escape(_intro(trade))}</p>",
         *(f"<p>{html.escape(line)}</p>" for line in sentences(trade)),
         "" if plot is None else f'<p><img alt="Pareto plots" src="{_inline(plot)}"></p>',
+        "<h2>Targets</h2>",
+        *(f"<p>{html.escape(line)}</p>" for line in target_lines(trade)),
         f'<h2>Every point</h2><div class="wide">{_table(trade)}</div>',
-        "<h2>Pictures</h2><p>Each point by one camera, and beside it where it differs from the default.</p>",
-        *(_figure(point, pictures[point.name]) for point in trade.points if point.name in pictures),
+        "<h2>Pictures</h2><p>Points by one camera, and beside each where it differs from the default.</p>",
+        *(_figure(alike, picture) for picture, alike in _by_picture(trade, pictures).items()),
         *(f"<p>Left out: {html.escape(f'{name}: {why}')}</p>" for name, why in trade.left_out.items()),
         f"<footer>{html.escape(trade.machine)}; {html.escape(trade.versions)}</footer></body></html>\n",
     ]
@@ -102,6 +106,23 @@ def sentences(trade: Trade) -> list[str]:
     return found
 
 
+def target_lines(trade: Trade) -> list[str]:
+    """What each target of `convert` chooses, beside the best point that was found here, a line each."""
+    wanted = {
+        "quality": "the declared bound",
+        "balanced": "bytes in memory over rays a second",
+        "small": "bytes on disk",
+        "fast": "time a ray",
+    }
+    lines = []
+    for one in chosen_of(trade.to_dict()):
+        away = (
+            "the best point" if one.best == one.point else f"{one.ratio:.2f} of that of the best, {one.best}"
+        )
+        lines.append(f"target {one.target} ({wanted[one.target]}) chooses {one.point}: {away}")
+    return lines
+
+
 def pictures_of(trade: Trade, folder: Path) -> dict[str, bytes]:
     """The pictures that a trade left in its folder, by the points' names."""
     paths = {point.name: folder / picture_name(point.name) for point in trade.points}
@@ -137,10 +158,21 @@ def _cell(point: Point, name: str) -> str:
     return f"<td{bad}>{text}</td>"
 
 
-def _figure(point: Point, picture: bytes) -> str:
-    caption = f"{point.name}: {point.psnr:.1f} dB" + (
-        "" if point.flip is None else f", FLIP {point.flip:.4f}"
+def _by_picture(trade: Trade, pictures: dict[str, bytes]) -> dict[bytes, list[Point]]:
+    """The points of each picture: most of those without an error share the default's."""
+    found: dict[bytes, list[Point]] = {}
+    for point in trade.points:
+        if point.name in pictures:
+            found.setdefault(pictures[point.name], []).append(point)
+    return found
+
+
+def _figure(points: list[Point], picture: bytes) -> str:
+    first, *others = points
+    caption = f"{first.name}: {first.psnr:.1f} dB" + (
+        "" if first.flip is None else f", FLIP {first.flip:.4f}"
     )
+    caption += f"; the same: {', '.join(point.name for point in others)}" if others else ""
     name = html.escape(caption)
     return f'<figure><img alt="{name}" src="{_inline(picture)}"><figcaption>{name}</figcaption></figure>'
 

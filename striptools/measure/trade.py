@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from striptools.choose import BASELINE
 from striptools.errors import MissingExtraError, UsageError
 from striptools.measure.bound import frame_rays
 from striptools.measure.environment import machine, versions
@@ -45,7 +46,7 @@ from striptools.measure.study import (
     timed_in_turn,
 )
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
-from striptools.measure.trade_points import BASELINE, Setting, settings
+from striptools.measure.trade_points import Setting, chosen_by_targets, settings
 from striptools.measure.verify import VerifyOptions, verify
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.clean import clean
@@ -189,6 +190,7 @@ class Trade:
         machine: Where it was measured.
         versions: With what.
         left_out: Points that could not be measured, and why.
+        targets: The name of the point that each target of `convert` chooses.
         points: The default first.
     """
 
@@ -199,6 +201,7 @@ class Trade:
     machine: str
     versions: str
     left_out: dict[str, str]
+    targets: dict[str, str]
     points: tuple[Point, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -236,7 +239,7 @@ def trade(
     mesh = mesh.flattened().geometry()
     base = replace(options.options, instances=False, geometry_only=True, remap=True)
     wanted = settings(base, quick=options.quick)
-    state = _State.opened(folder, _key(mesh, options, wanted))
+    state = _State.opened(folder, _key(mesh, options), wanted)
     tell(BASELINE, 0.0)
     bench = _Bench(mesh, options, base)
     for done, setting in enumerate(wanted):
@@ -254,14 +257,15 @@ def trade(
     found = [state.points[setting.name] for setting in wanted if setting.name in state.points]
     rays = (len(bench.rays[0].origins), len(bench.rays[1].origins))
     facts = (bench.scene.triangle_count, bench.diagonal, rays, machine(), versions(), state.left_out)
-    return Trade(model, *facts, tuple(found))
+    targets = chosen_by_targets(base, wanted)
+    return Trade(model, *facts, targets, tuple(found))
 
 
-def _key(mesh: Mesh, options: TradeOptions, wanted: tuple[Setting, ...]) -> str:
+def _key(mesh: Mesh, options: TradeOptions) -> str:
     """What has to be the same for points of an earlier run to count."""
     hashed = hashlib.sha256(mesh.positions.tobytes())
     hashed.update(mesh.faces.tobytes())
-    hashed.update(repr((options, wanted, machine(), versions())).encode())
+    hashed.update(repr((options, machine(), versions())).encode())
     return hashed.hexdigest()
 
 
@@ -271,17 +275,20 @@ class _State:
 
     folder: Path | None
     key: str
+    settings: dict[str, str]
     points: dict[str, Point] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def opened(cls, folder: Path | None, key: str) -> "_State":
-        state = cls(folder, key)
+    def opened(cls, folder: Path | None, key: str, wanted: tuple[Setting, ...]) -> "_State":
+        state = cls(folder, key, {setting.name: repr(setting) for setting in wanted})
         if folder is None or not (folder / STATE).is_file():
             return state
         try:
             facts = json.loads((folder / STATE).read_text(encoding="utf-8"))
-            kept = {row["name"]: Point(**row) for row in facts["points"]} if facts["key"] == key else {}
+            same = [name for name, by in facts["settings"].items() if state.settings.get(name) == by]
+            rows = facts["points"] if facts["key"] == key else []
+            kept = {row["name"]: Point(**row) for row in rows if row["name"] in same}
         except (OSError, ValueError, KeyError, TypeError):
             # Of another version, or damaged: everything is measured again.
             return state
@@ -293,7 +300,11 @@ class _State:
             return
         last = list(self.points.values())[-1]
         save_png(picture, self.folder / picture_name(last.name))
-        facts = {"key": self.key, "points": [asdict(point) for point in self.points.values()]}
+        facts = {
+            "key": self.key,
+            "settings": self.settings,
+            "points": [asdict(point) for point in self.points.values()],
+        }
         write_atomically(self.folder / STATE, json.dumps(facts, indent=1).encode())
 
 

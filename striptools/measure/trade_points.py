@@ -1,18 +1,18 @@
-"""The points of a trade: the default, one factor at a time around it, and a few named pairs.
+"""The points of a trade: the default, one factor at a time around it, a few named pairs, what targets choose.
 
 There is one precision of stored boxes (8 bits a plane on the scene's grid, SPEC 4.4); what can be chosen is
 whether those inside blocks are stored or rebuilt, and that is the factor here and in the pair with residency.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
+from striptools.choose import BASELINE, TARGET, TARGETS, for_target
 from striptools.hierarchies.options import HierarchyName, HierarchyOptions
 from striptools.pipeline import Options
 from striptools.reducem.quantize import PrecisionOptions
+from striptools.reducem.resident import Residency
 from striptools.types import TriangleTest
-
-BASELINE = "default"
 
 BITS = (24, 22, 20, 18, 16, 14, 12, 10, 8)
 SHARES = (0.5, 0.25, 0.1, 0.05, 0.02, 0.01)
@@ -27,8 +27,6 @@ QUICK_BLOCKS = (64,)
 TESTS: tuple[TriangleTest, ...] = ("fast", "exact-sign", "float64")
 
 PAIR_BITS, PAIR_SHARES = (16, 12), (0.25, 0.05)
-
-Residency = Literal["expanded", "compressed"]
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,24 @@ def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
         if not quick or (b, share) == (PAIR_BITS[0], PAIR_SHARES[0])
     ]
     found.append(Setting("residency x boxes", "compressed, stored", stored, resident="compressed"))
-    return tuple(found)
+    chosen = [one for one in _of_targets(base) if not any(_is_the_same(one, other) for other in found)]
+    return tuple(found + chosen)
+
+
+def chosen_by_targets(base: Options, points: tuple[Setting, ...]) -> dict[str, str]:
+    """The name of the point that each target chooses, among these."""
+    same = ((one.value, [p for p in points if _is_the_same(one, p)]) for one in _of_targets(base))
+    return {target: found[0].name for target, found in same if found}
+
+
+def _of_targets(base: Options) -> list[Setting]:
+    """What each target chooses by the table of the package."""
+    chosen = ((target, *for_target(base, target)) for target in TARGETS)
+    return [Setting(TARGET, target, options, resident=way) for target, options, way, _ in chosen]
+
+
+def _is_the_same(one: Setting, other: Setting) -> bool:
+    return replace(one, factor=other.factor, value=other.value) == other
 
 
 def _on_grid(base: Options, bits: int) -> Options:
