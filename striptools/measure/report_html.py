@@ -38,7 +38,8 @@ COLUMNS = {
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1250px; padding: 0 1rem; }
 table { border-collapse: collapse; font-size: 12px; } th, td { padding: 2px 7px; text-align: right; }
-th { border-bottom: 2px solid #999; vertical-align: bottom; } td:first-child { text-align: left; white-space: nowrap; }
+th { border-bottom: 2px solid #999; vertical-align: bottom; }
+td:first-child { text-align: left; white-space: nowrap; }
 tr:nth-child(even) { background: #f4f5f7; } .wide { overflow-x: auto; } img { max-width: 100%; }
 figure { display: inline-block; margin: 6px; width: 390px; vertical-align: top; }
 figcaption { font-size: 12px; }

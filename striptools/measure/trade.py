@@ -208,6 +208,16 @@ class Trade:
         """Plain values for JSON."""
         return asdict(self)
 
+    @classmethod
+    def from_dict(cls, facts: dict[str, Any]) -> "Trade":
+        """The trade that `to_dict` gave.
+
+        Raises:
+            TypeError: It is of another version.
+        """
+        points, rays = tuple(Point(**row) for row in facts["points"]), tuple(facts["rays"])
+        return cls(**{**facts, "points": points, "rays": rays})
+
 
 def trade(
     mesh: Mesh,

@@ -7,7 +7,8 @@ for General Polygonal Models" (SIGGRAPH 2009). Differences:
    the other surface: that distance is convex, so no point of the piece is farther away. The triangles tried
    are those closest to the corners.
 2. Pieces that may still hold the farthest point are cut in four at their edges' midpoints, all at once, a
-   round after another, until the bounds meet to a tolerance, or a limit is decided, or pieces run out; both
+   round after another, first bounded by the triangles of the whole and then by those closest to their own
+   corners, until the bounds meet to a tolerance, or a limit is decided, or pieces run out; both
    bounds hold whenever it ends.
 3. Closest triangles are found through an implicit tree over triangles in Morton order (kernels).
 
@@ -120,9 +121,17 @@ def deviation(
         remaining = float(bound[open_ones].max())
         pieces, items = pieces[open_ones], items[open_ones]
         middles = (pieces + np.roll(pieces, -1, axis=1)) / 2
-        away, found = surface.closest(middles.reshape(-1, 3))
-        lower = max(lower, float(away.max()))
-        pieces, items = _cut(pieces, middles), _cut(items, found.reshape(-1, 3))
+        parts = _cut(pieces, middles)
+        # Most parts are near enough to a triangle that was tried for the whole: those need no search.
+        bound = surface.farthest_of(parts, np.tile(items, (4, 1)))
+        far = bound > enough
+        upper = max(upper, float(bound[~far].max(initial=0.0)))
+        wanted = _middles_of(far)
+        away, found = surface.closest(middles[wanted])
+        lower = max(lower, float(away.max(initial=0.0)))
+        at_middles = np.zeros(items.shape, np.int32)
+        at_middles[wanted] = found
+        pieces, items = parts[far], _cut(items, at_middles)[far]
     else:
         upper = max(upper, remaining)
     return Deviation(max(0.0, lower - slack), max(lower, upper) + slack, rms)
@@ -142,6 +151,12 @@ def _cut(pieces: np.ndarray, middles: np.ndarray) -> np.ndarray:
     (a, b, c), (ab, bc, ca) = (np.moveaxis(corners, 1, 0) for corners in (pieces, middles))
     parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
     return np.concatenate([np.stack(part, axis=1) for part in parts])
+
+
+def _middles_of(parts: np.ndarray) -> np.ndarray:
+    """(k, 3) bool: the middles of k pieces that are corners of these parts, (4k,) bool in `_cut`'s order."""
+    first, second, third, inner = parts.reshape(4, -1)
+    return np.stack([first | second, second | third, third | first], axis=1) | inner[:, None]
 
 
 def _boxes_over(corners: np.ndarray) -> np.ndarray:
