@@ -23,19 +23,32 @@ INK = {
     "triangle test": "#6b6f76",
     "precision x simplification": "#7fb2d6",
     "residency x boxes": "#eaa9c9",
-    TARGET: "#e04f1a",
+    TARGET: "#111111",
 }
 """A colour for each factor."""
+
+MARKERS = {BASELINE: (110, "*"), TARGET: (34, "D")}
+"""Sizes and shapes of factors whose points are no dots."""
 
 LEAST_ERROR = 1e-8
 """Where points without an error stand on a logarithmic axis, in diagonals."""
 
 MEMORY = "as traced, bytes per source triangle"
 
-FILE_LABELS = {"precision": "left", "simplification": "right"}
-MEMORY_LABELS = {"precision": "left", "simplification": "right", "residency": "right"}
-SPEED_LABELS = {"simplification": "right", "residency": "right", "triangle test": "left", "hierarchy": "left"}
+Sides = dict[str, str]
 """The factors whose points a panel names, and on which side of them."""
+
+FILE_SIDES: Sides = {"precision": "left", "simplification": "right", TARGET: "right"}
+MEMORY_SIDES: Sides = {"precision": "left", "simplification": "right", "residency": "right", TARGET: "right"}
+SPEED_SIDES: Sides = {
+    "simplification": "right",
+    "residency": "right",
+    "triangle test": "left",
+    "hierarchy": "left",
+}
+
+COVERED = (0.12, 0.035)
+"""Within which parts of a panel, across and down, one name would cover another."""
 
 
 def pareto(costs: np.ndarray) -> np.ndarray:
@@ -54,8 +67,8 @@ def plot_trade(trade: Trade) -> bytes:
     """
     figure = require_plots().Figure(figsize=(13.5, 4.6), dpi=90, layout="constrained")
     disk, memory, speed = figure.subplots(1, 3)
-    _panel(disk, trade, "disk_per_triangle", "file, bytes per source triangle", FILE_LABELS)
-    _panel(memory, trade, "memory_per_triangle", MEMORY, MEMORY_LABELS)
+    _panel(disk, trade, "disk_per_triangle", "file, bytes per source triangle", FILE_SIDES)
+    _panel(memory, trade, "memory_per_triangle", MEMORY, MEMORY_SIDES)
     _speed_panel(speed, trade)
     handles, labels = speed.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
@@ -65,10 +78,10 @@ def plot_trade(trade: Trade) -> bytes:
     return png_of(figure)
 
 
-def _panel(axes: "Axes", trade: Trade, bytes_name: str, label: str, labels: dict[str, str]) -> None:
+def _panel(axes: "Axes", trade: Trade, bytes_name: str, label: str, sides: Sides) -> None:
     """Bytes against the largest error."""
     points = [(getattr(p, bytes_name), max(p.largest_error, LEAST_ERROR)) for p in trade.points]
-    _scatter(axes, trade.points, points, labels)
+    _scatter(axes, trade.points, points)
     _front(axes, np.array(points), np.array(points))
     axes.set_yscale("log")
     places = 10.0 ** np.arange(np.log10(LEAST_ERROR), 0)
@@ -77,17 +90,19 @@ def _panel(axes: "Axes", trade: Trade, bytes_name: str, label: str, labels: dict
     axes.set_ylim(LEAST_ERROR / 2, 0.3)
     _bytes_axis(axes, label)
     axes.set_ylabel("largest error, diagonals", fontsize=9)
+    _name(axes, trade.points, points, sides)
 
 
 def _speed_panel(axes: "Axes", trade: Trade) -> None:
     """Bytes as traced against rays a second, secondary rays."""
     points = [(p.memory_per_triangle, p.secondary_ratio) for p in trade.points]
-    _scatter(axes, trade.points, points, SPEED_LABELS)
+    _scatter(axes, trade.points, points)
     places = np.array(points)
     _front(axes, places, places * [1, -1])
     axes.axhline(1.0, color=LIGHT, linewidth=0.8, zorder=0)
     _bytes_axis(axes, MEMORY)
     axes.set_ylabel("secondary rays a second, default = 1", fontsize=9)
+    _name(axes, trade.points, points, SPEED_SIDES)
 
 
 def _bytes_axis(axes: "Axes", label: str) -> None:
@@ -104,23 +119,31 @@ def _bytes_axis(axes: "Axes", label: str) -> None:
     axes.set_xlabel(label, fontsize=9)
 
 
-def _scatter(
-    axes: "Axes", points: tuple[Point, ...], places: list[tuple[float, float]], labels: dict[str, str]
-) -> None:
+def _scatter(axes: "Axes", points: tuple[Point, ...], places: list[tuple[float, float]]) -> None:
     for factor, ink in INK.items():
         chosen = [k for k, point in enumerate(points) if point.factor == factor]
         if not chosen:
             continue
         x, y = zip(*(places[k] for k in chosen), strict=True)
-        base = factor == BASELINE
-        look = {"s": 110 if base else 26, "marker": "*" if base else "o", "zorder": 4 if base else 3}
-        axes.scatter(x, y, color=ink, label=factor, **look)
-        for k in chosen if factor in labels else ():
-            text, side = points[k].value.removesuffix(" bits"), labels[factor]
-            look = {"fontsize": 7, "color": ink, "ha": "right" if side == "left" else "left", "va": "center"}
+        size, marker = MARKERS.get(factor, (26, "o"))
+        axes.scatter(x, y, color=ink, label=factor, s=size, marker=marker, zorder=3 + (factor in MARKERS))
+
+
+def _name(axes: "Axes", points: tuple[Point, ...], places: list[tuple[float, float]], sides: Sides) -> None:
+    """Write the values of points beside them, those that would cover each other as one."""
+    where = (axes.transScale + axes.transLimits).transform(places)
+    for factor, side in sides.items():
+        chosen = [k for k, point in enumerate(points) if point.factor == factor]
+        while chosen:
+            near = (np.abs(where[chosen] - where[chosen[0]]) < COVERED).all(axis=1)
+            together = [k for k, is_near in zip(chosen, near, strict=True) if is_near]
+            chosen = [k for k in chosen if k not in together]
+            names = [points[k].value.removesuffix(" bits") for k in together]
+            text = ", ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]}"
+            look = {"fontsize": 7, "color": INK[factor], "va": "center"}
             # A little up or down, away from the lines that fall from left to right.
-            shift = (-5, -3) if side == "left" else (5, 3)
-            axes.annotate(text, places[k], xytext=shift, textcoords="offset points", **look)
+            shift, ha = ((-5, -3), "right") if side == "left" else ((5, 3), "left")
+            axes.annotate(text, places[together[0]], xytext=shift, textcoords="offset points", ha=ha, **look)
 
 
 def _front(axes: "Axes", places: np.ndarray, costs: np.ndarray) -> None:

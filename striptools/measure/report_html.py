@@ -98,8 +98,9 @@ def sentences(trade: Trade) -> list[str]:
     fewer = [point for point in trade.points if point.factor == "simplification"]
     if fewer:
         one = min(fewer, key=lambda p: abs(p.triangles / trade.triangles - 0.25))
+        kept = one.triangles / trade.triangles
         found.append(
-            f"Simplification buys everything but error: {one.value} of the triangles take "
+            f"Simplification buys everything but error: {kept:.0%} of the triangles take "
             f"{one.memory_per_triangle:.1f} bytes per source triangle in memory, but the surface strays by "
             f"up to {one.declared_bound:.1e} diagonals and {one.wrong_per_million:,.0f} rays of a million "
             "end on another part of it."
@@ -132,8 +133,8 @@ def pictures_of(trade: Trade, folder: Path) -> dict[str, bytes]:
 
 def _intro(trade: Trade) -> str:
     return (
-        f"{trade.triangles:,} triangles, {trade.rays[0]:,} primary and {trade.rays[1]:,} secondary rays. One "
-        "factor at a time differs from the default. Lengths are in diagonals of the model, "
+        f"{trade.triangles:,} triangles, {trade.rays[0]:,} primary and {trade.rays[1]:,} secondary rays of four "
+        "views. One factor at a time differs from the default. Lengths are in diagonals of the model, "
         f"{trade.diagonal:.6g} units; bytes are divided by the triangles of the source; rays a second are "
         "those of the point over those of the default, traced in turn in the same run."
     )

@@ -36,7 +36,7 @@ from striptools.trace import Tracer
 from striptools.trace.counters import Counters
 from striptools.trace.device import DeviceKind
 from striptools.trace.layout import Layout
-from striptools.trace.rays import UP_CHOICES, Camera, camera_rays, cosine_rays
+from striptools.trace.rays import THREE_QUARTER, UP_CHOICES, Camera, camera_rays, cosine_rays
 from striptools.types import RayVectors
 
 REFERENCE = "strip-rt"
@@ -290,9 +290,15 @@ def _bytes(scene: Scene) -> int:
     return sum(parts.values()) - parts["remap"] - parts["attributes"]
 
 
-def study_rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[RaySet, RaySet]:
+def study_rays(
+    scene: Scene,
+    tracer: Tracer,
+    options: StudyOptions,
+    view: tuple[float, float, float] = THREE_QUARTER,
+) -> tuple[RaySet, RaySet]:
     """Primary rays of one camera, and a secondary one from each of their hits, towards its side."""
-    camera = Camera.framing(scene.positions, width=options.side, height=options.side, up=options.up)
+    size = {"width": options.side, "height": options.side}
+    camera = Camera.framing(scene.positions, **size, view=view, up=options.up)
     origins, directions = camera_rays(camera)
     hits = tracer.closest_hit(origins, directions)
     hit = np.flatnonzero(hits.face >= 0)

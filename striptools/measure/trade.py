@@ -10,14 +10,16 @@ What is measured of a point, in diagonals of the model where it is a length:
 2. Position errors: of corners from the source's, in float64, where faces are the source's; of the surfaces
    from each other, both ways, where they were simplified (certified bounds, mesh/surface_distance.py). The
    declared bound is what the file says, or the certified bound of the surfaces.
-3. Errors of t and of normals at the rays that hit in both, against the source's face in float64. A ray is
+3. Primary rays come from four views, two from above and two from below: how the children of a few nodes
+   near the root stand in their slots is worth 25 % to the rays of one view of a flat model, nothing over all.
+4. Errors of t and of normals at the rays that hit in both, against the source's face in float64. A ray is
    wrong where it hits and the source's does not, or the other way, or where its t is `JUMP` diagonals off: it
    then is on another part of the surface. Secondary rays start at the source's surface, so that where a
    point's lies outside of it they hit it at once: that counts, as it would in a renderer with baked origins.
-4. Leaks and disagreements are those of `verify`: the scene against the mesh that it was made from, by the
+5. Leaks and disagreements are those of `verify`: the scene against the mesh that it was made from, by the
    bound of the triangle test in use. Where that is `fast`, rays leak. Tests other than the default one do
    without packets, which the default one's camera rays go in.
-5. Pictures: the default's and the point's by one camera; PSNR, FLIP where it is installed, and how many of a
+6. Pictures: the default's and the point's by one camera; PSNR, FLIP where it is installed, and how many of a
    million pixels change between hit and miss (the silhouette).
 """
 
@@ -59,7 +61,7 @@ from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.trace import Tracer
 from striptools.trace.device import DeviceKind
-from striptools.trace.rays import Camera
+from striptools.trace.rays import THREE_QUARTER, Camera
 from striptools.trace.render import RenderOptions, render, save_png
 
 JUMP = 0.01
@@ -67,6 +69,13 @@ JUMP = 0.01
 
 STATE = "trade.json"
 """The file of a folder that the points done are kept in."""
+
+SIDES = ((1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1))
+VIEWS = tuple((r * THREE_QUARTER[0], u * THREE_QUARTER[1], f * THREE_QUARTER[2]) for r, u, f in SIDES)
+"""Where primary rays come from, as `Camera.framing` says it."""
+
+LEAST_SIDE = 8
+"""Pixels across and down that a view has at least."""
 
 CHUNK = 1 << 17
 WARMING = 512
@@ -80,7 +89,7 @@ class TradeOptions:
     Attributes:
         options: What all conversions have in common; instances are flattened, attributes left out.
         quick: Few values of each factor.
-        side: Pixels across and down; a primary ray each, 8 to 4096.
+        side: Pixels across and down, 8 to 4096; a primary ray each, a quarter of them in each of `VIEWS`.
         runs: Runs whose ratios are taken the median of.
         picture: Pixels across and down of pictures.
         verify_rays: Rays of each kind that are tried against every face.
@@ -334,7 +343,7 @@ class _Bench:
         self.whole = cleaned.mesh
         self.diagonal = float(np.linalg.norm(self.whole.bounds[1] - self.whole.bounds[0]))
         self.tracer = Tracer(self.scene, device=options.device, threads=options.threads)
-        self.rays = study_rays(self.scene, self.tracer, options.study())
+        self.rays = _rays_of_views(self.scene, self.tracer, options.study())
         self._surface: Surface | None = None
         self._fewer: dict[float, tuple[Mesh, float]] = {}
         self.camera = Camera.framing(
@@ -479,6 +488,19 @@ class _Bench:
         lengths = [None if one is None else one / self.diagonal for one in found[1:]]
         names = ("largest_error", "rms_error", "declared_bound", "peer_error")
         return {"error_kind": found[0], **dict(zip(names, lengths, strict=True))}
+
+
+def _rays_of_views(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[RaySet, RaySet]:
+    """Primary rays of each view, and a secondary one from each of their hits."""
+    each = replace(options, side=max(LEAST_SIDE, options.side // 2))
+    kinds = zip(*(study_rays(scene, tracer, each, view) for view in VIEWS), strict=True)
+    primary, secondary = (_together(parts) for parts in kinds)
+    return primary, secondary
+
+
+def _together(parts: tuple[RaySet, ...]) -> RaySet:
+    origins = np.concatenate([part.origins for part in parts])
+    return RaySet(origins, np.concatenate([part.directions for part in parts]))
 
 
 def peer_distance(one: Mesh, other: Mesh, samples: int = 100_000) -> float | None:
