@@ -36,6 +36,9 @@ TABLE = "choose_table.json"
 BASELINE, TARGET = "default", "target"
 """Factors of a trade that stand for no choice of their own: the default, and what a target chose."""
 
+PAIR = " x "
+"""What stands between the factors of a pair."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -207,6 +210,8 @@ NEAR = 0.05
 def best_row(table: tuple[Row, ...], target: Target, largest: float) -> Row:
     """The row that a target asks for, none of a larger bound; the default where nothing is clearly better.
 
+    A pair of factors is chosen only where it is clearly better than each factor by itself.
+
     Args:
         table: The rows; simplified ones and other triangle tests, which may leak, are never chosen.
         target: What matters most.
@@ -215,7 +220,7 @@ def best_row(table: tuple[Row, ...], target: Target, largest: float) -> Row:
     allowed = [row for row in table if may_choose(row.factor) and row.bound <= largest]
     best = min(cost_of(row, target) for row in allowed)
     near = [row for row in allowed if cost_of(row, target) <= best * (1 + NEAR)]
-    return min(near, key=lambda row: (row.factor != BASELINE, cost_of(row, target)))
+    return min(near, key=lambda row: (row.factor != BASELINE, PAIR in row.factor, cost_of(row, target)))
 
 
 def for_target(

@@ -1,5 +1,6 @@
 """Choosing: the smallest precision that keeps an error, budgets, targets against a full sweep."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,15 @@ def test_a_target_takes_the_best_row_of_its_table(part: Mesh, target) -> None:
 def test_what_is_not_clearly_better_leaves_the_default() -> None:
     rows = (Row("default", "", 1.0, 1.0, 1.0, 0.0), Row("boxes", "stored", 1.0, 1.3, 1.03, 0.0))
     assert best_row(rows, "fast", 0.0).factor == "default"
+
+
+def test_a_pair_that_is_not_clearly_better_leaves_one_factor() -> None:
+    alone = Row("residency", "compressed", 0.22, 1.0, 0.6, 0.0)
+    pair = Row("residency x boxes", "compressed, stored", 0.213, 1.3, 0.6, 0.0)
+    rows = (Row("default", "", 1.0, 1.0, 1.0, 0.0), alone, pair)
+    assert best_row(rows, "balanced", 0.0) == alone
+    better = replace(pair, memory=0.2)
+    assert best_row((*rows, better), "balanced", 0.0) == better
 
 
 def test_the_shipped_table_is_whole() -> None:

@@ -133,8 +133,8 @@ def pictures_of(trade: Trade, folder: Path) -> dict[str, bytes]:
 
 def _intro(trade: Trade) -> str:
     return (
-        f"{trade.triangles:,} triangles, {trade.rays[0]:,} primary and {trade.rays[1]:,} secondary rays of four "
-        "views. One factor at a time differs from the default. Lengths are in diagonals of the model, "
+        f"{trade.triangles:,} triangles, {trade.rays[0]:,} primary and {trade.rays[1]:,} secondary rays of "
+        "four views. One factor at a time differs from the default. Lengths are in diagonals of the model, "
         f"{trade.diagonal:.6g} units; bytes are divided by the triangles of the source; rays a second are "
         "those of the point over those of the default, traced in turn in the same run."
     )
