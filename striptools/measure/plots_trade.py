@@ -65,7 +65,7 @@ def plot_trade(trade: Trade) -> bytes:
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure = require_plots().Figure(figsize=(13.5, 4.6), dpi=90, layout="constrained")
+    figure = require_plots().Figure(figsize=(13.5, 4.6), dpi=80, layout="constrained")
     disk, memory, speed = figure.subplots(1, 3)
     _panel(disk, trade, "disk_per_triangle", "file, bytes per source triangle", FILE_SIDES)
     _panel(memory, trade, "memory_per_triangle", MEMORY, MEMORY_SIDES)
