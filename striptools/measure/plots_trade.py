@@ -42,10 +42,13 @@ FILE_SIDES: Sides = {"precision": "left", "simplification": "right", TARGET: "ri
 MEMORY_SIDES: Sides = {"precision": "left", "simplification": "right", "residency": "right", TARGET: "right"}
 SPEED_SIDES: Sides = {
     "simplification": "right",
-    "residency": "right",
-    "triangle test": "left",
+    "residency": "below",
+    "triangle test": "right",
     "hierarchy": "left",
 }
+
+SHIFTS = {"left": ((-5, -3), "right"), "right": ((5, 3), "left"), "below": ((5, -5), "left")}
+"""How far a name stands from its point; to a side, a little off the lines that fall from left to right."""
 
 COVERED = (0.12, 0.035)
 """Within which parts of a panel, across and down, one name would cover another."""
@@ -109,8 +112,8 @@ def _bytes_axis(axes: "Axes", label: str) -> None:
     """A logarithmic axis across, with plain numbers and room for the names of points."""
     axes.set_xscale("log")
     low, high = axes.get_xlim()
-    axes.set_xlim(low / 1.1, high * 1.1)
-    low, high = low / 1.1, high * 1.1
+    low, high = low / 1.1, high * 1.4
+    axes.set_xlim(low, high)
     steps = (1, 2, 5) if high / low < 100 else (1,)
     ticks = [step * 10.0**power for power in range(-3, 6) for step in steps]
     ticks = [tick for tick in ticks if low <= tick <= high]
@@ -141,8 +144,7 @@ def _name(axes: "Axes", points: tuple[Point, ...], places: list[tuple[float, flo
             names = [points[k].value.removesuffix(" bits") for k in together]
             text = ", ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]}"
             look = {"fontsize": 7, "color": INK[factor], "va": "center"}
-            # A little up or down, away from the lines that fall from left to right.
-            shift, ha = ((-5, -3), "right") if side == "left" else ((5, 3), "left")
+            shift, ha = SHIFTS[side]
             axes.annotate(text, places[together[0]], xytext=shift, textcoords="offset points", ha=ha, **look)
 
 
