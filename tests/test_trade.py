@@ -12,6 +12,7 @@ from striptools.choose import BASELINE
 from striptools.measure import trade as module
 from striptools.measure.plots_trade import pareto, plot_trade
 from striptools.measure.report_html import pictures_of, report_html, sentences
+from striptools.measure.study import study_rays
 from striptools.measure.trade import STATE, Trade, TradeOptions, peer_distance, trade
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
 from striptools.measure.trade_points import Setting, settings
@@ -23,6 +24,9 @@ from striptools.reducem.quantize import PrecisionOptions
 
 CHANDELIER = Path(__file__).parent.parent / "samples" / "chandelier.ply"
 SMALL = TradeOptions(quick=True, side=32, runs=1, picture=32, verify_rays=4, aimed_rays=64)
+BASE = Options(instances=False, geometry_only=True, remap=True)
+"""What a trade makes of the default options."""
+
 NAMES = ("default", "precision: 8 bits", "simplification: 25%", "residency: compressed")
 
 
@@ -123,7 +127,36 @@ def test_an_interrupted_trade_goes_on(
     # Other options, or a damaged file: everything again.
     for text in (json.dumps({**kept, "key": "other"}), "{"):
         (tmp_path / STATE).write_text(text)
-        assert not module._State.opened(tmp_path, state["key"], few(Options())).points
+        assert not module._State.opened(tmp_path, state["key"], few(BASE)).points
+
+
+def test_a_point_whose_setting_changed_is_measured_again(done: tuple[Trade, Path]) -> None:
+    state = json.loads((done[1] / STATE).read_text())
+    wanted = few(BASE)
+    changed = (*wanted[:3], replace(wanted[3], resident="expanded"))
+    assert set(module._State.opened(done[1], state["key"], wanted).points) == set(NAMES)
+    assert set(module._State.opened(done[1], state["key"], changed).points) == set(NAMES[:3])
+
+
+def test_rays_come_from_four_views(mesh: Mesh) -> None:
+    bench = module._Bench(mesh, SMALL, Options())
+    primary, secondary = bench.rays
+    assert len(primary.origins) == SMALL.side**2
+    assert len(np.unique(primary.origins, axis=0)) == len(module.VIEWS) == 4
+    # The first quarter are those of a study, by its one camera.
+    alone = study_rays(bench.scene, bench.tracer, replace(SMALL.study(), side=SMALL.side // 2))
+    assert np.array_equal(primary.directions[: len(alone[0].directions)], alone[0].directions)
+    assert np.array_equal(secondary.origins[: len(alone[1].origins)], alone[1].origins)
+
+
+def test_a_share_is_simplified_once(mesh: Mesh) -> None:
+    pytest.importorskip("fast_simplification")
+    bench = module._Bench(mesh, SMALL, Options())
+    first, second = bench._source(0.25), bench._source(0.25)
+    assert first[0] is second[0]
+    assert first[1] == second[1] > 0
+    assert bench._source(0.5)[0].triangle_count > first[0].triangle_count
+    assert bench._source(1.0) == (mesh, 0.0)
 
 
 def test_json_and_back(done: tuple[Trade, Path]) -> None:

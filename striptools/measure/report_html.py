@@ -102,8 +102,8 @@ def sentences(trade: Trade) -> list[str]:
         found.append(
             f"Simplification buys everything but error: {kept:.0%} of the triangles take "
             f"{one.memory_per_triangle:.1f} bytes per source triangle in memory, but the surface strays by "
-            f"up to {one.declared_bound:.1e} diagonals and {one.wrong_per_million:,.0f} rays of a million "
-            "end on another part of it."
+            f"up to {one.declared_bound:.1e} diagonals and, secondary rays starting at the source surface, "
+            f"{one.wrong_per_million:,.0f} rays of a million end on another part of it."
         )
     return found
 
