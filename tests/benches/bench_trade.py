@@ -61,9 +61,11 @@ def _judged(trade: dict[str, Any]) -> bool:
 
 def keep(trade: dict[str, Any]) -> None:
     """Write a trade's figures, table and plot."""
-    whole, name = Trade.from_dict(trade), f"trade-{trade['model']}"
+    name = f"trade-{trade['model']}"
+    trade = {**trade, "points": [rounded(point) for point in trade["points"]]}
+    whole = Trade.from_dict(trade)
     # A line a point, so that a change of one is a change of one line.
-    rows = ",\n".join(json.dumps(rounded(point)) for point in trade["points"])
+    rows = ",\n".join(json.dumps(point) for point in trade["points"])
     facts = json.dumps({**trade, "points": []}).removesuffix("]}")
     (KEPT / f"{name}.json").write_text(f"{facts}\n{rows}\n]}}\n", encoding="utf-8")
     (KEPT / f"{name}.md").write_text(printed(whole, "md"), encoding="utf-8")
