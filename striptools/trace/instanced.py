@@ -174,9 +174,13 @@ class InstancedLayout:
         hit = np.flatnonzero(instance >= 0)
         t[at] = traced[0]
         instance, rows = instance[hit], at[hit]
-        own_t, own_face, own_u, own_v, own_triangle = (np.zeros(len(hit), one.dtype) for one in found)
+        own_t, own_face, own_u, own_v, own_triangle = (
+            np.zeros(min(len(hit), len(one)), one.dtype) for one in found
+        )
         inside = (own_t, own_face, own_u, own_v, own_triangle)
-        local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
+        local = rays
+        if len(u):
+            local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
         given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
         self.geometries.weigh(local, *given, inside)
         geometry, turned = self.numbers.geometry[instance], self.mirrored[instance]
@@ -184,7 +188,8 @@ class InstancedLayout:
         triangle[rows] = own_triangle + (
             self.numbers.first_triangle[instance] - self.first_triangle[geometry]
         )
-        u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
+        if len(u):
+            u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
 
     def moved(
         self, origins: np.ndarray, directions: np.ndarray, instance: np.ndarray
