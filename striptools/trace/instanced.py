@@ -19,7 +19,7 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.wide import EMPTY, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.partition.object_split import split_objects
-from striptools.trace.box import MARGIN
+from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
 from striptools.trace.layout import Found, Layout, PacketView, Rays
@@ -31,7 +31,6 @@ from striptools.trace.walk_instances import InstancedScene, trace_instances
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
-U = 2.0**-24
 MOST_SLIP = 0.25
 """The most of gamma_3 k + n for which rays are moved in float32: an instance more sheared is refused."""
 
@@ -333,7 +332,7 @@ def _slips(
     gamma_3, gamma_4 = 3 * U / (1 - 3 * U), 4 * U / (1 - 4 * U)
     slip = gamma_3 * k + n
     off = (gamma_4 * k + n + 2 * slip + gamma_4 * h + r) / (1 - slip)
-    test = 6 * U * (k + h + row_sum(np.abs(a)) * extent / reach)
+    test = REACH * (k + h + row_sum(np.abs(a)) * extent / reach)
     return np.where(slip < MOST_SLIP, (off + test + OTHER_SLIPS) * (1 + 2.0**-10), np.inf)
 
 
