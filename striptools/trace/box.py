@@ -25,8 +25,9 @@ difference 6: where they are on one side in both, a wrong sign leaves 0 inside b
 axis it passes 0 within 2 u r (1 - r) E F / (E + F), with E and F its extents in x and y, at most 4L, and r
 the share of it at which it passes. So some point of the triangle lies off the ray by the errors of its
 corners, weighed by what makes 0 of their p, and by that distance. Near a corner p is small, a_x is S a_z, and
-the errors are u + 3u times 2L. In the middle of a large edge they are less, because no origin has both ends of
-it 2L away, and leave room for the rest. The largest sum is 8uL to first order, and gamma_4 2L in all: `REACH`.
+the errors are u + 3u times 2L. In the middle of a large edge they are less, because no origin has both ends
+of it 2L away, and leave room for the rest. The largest sum is 8uL to first order, and gamma_4 2L in all:
+`REACH`.
 
 The slab test itself: rounding o +- margin moves a side by uL, rounding its product with the inverse by uL,
 and rounding side * inverse, where that is not fused, by uL: `ROUNDINGS`. What is left is relative to the
