@@ -268,7 +268,8 @@ def got_worse(rows: list[Row], before: Last, *, noise: float = NOISE) -> list[st
         by_ratio = row.ratio is not None and bool(last["ratio"]) and last["peer"] == row.peer
         was = float(last["ratio"] if by_ratio else last["value"])
         now = row.ratio if by_ratio and row.ratio is not None else row.value
-        if row.unit == "s" and max(row.value, float(last["value"])) < SHORT:
+        is_time = row.unit == "s" or row.metric.startswith("seconds")
+        if is_time and max(row.value, float(last["value"])) < SHORT:
             continue
         slack = _slack(row, by_ratio, noise)
         limit = was * (1 + slack) * (1 + 1e-5) if better < 0 else was * (1 - slack) * (1 - 1e-5)
