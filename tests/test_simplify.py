@@ -268,5 +268,5 @@ def test_the_command_line_proves_what_it_simplified(tmp_path: Path, capsys: pyte
     save_mesh(wavy(height=0.2), model)
     assert main(["verify", str(scene), "--against", str(model), *rays]) == 1
     assert "FARTHER than declared" in capsys.readouterr().out.splitlines()[0]
-    assert main(["convert", str(model), str(scene), "--simplify", "5%", "--simplify-error", "1e-6"]) == 2
+    assert main(["convert", str(model), "b.rdm", "--simplify", "5%", "--simplify-error", "1e-6"]) == 2
     assert "stray by up to" in capsys.readouterr().err

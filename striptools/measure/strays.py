@@ -83,17 +83,17 @@ def _declared(scene: Scene) -> tuple[int, float, float]:
     """Triangles before, and the upper bounds of both distances, by what the metadata say."""
     told = scene.metadata[SIMPLIFIED]
     try:
-        bounds = [float(told[f"hausdorff_of_{which}"][1]) for which in ("source", "result")]
+        of_source, of_result = (float(told[f"hausdorff_of_{which}"][1]) for which in ("source", "result"))
         before = int(told["triangles_before"])
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):
-        bounds, before = [math.nan], 0
-    if not all(0.0 <= bound < math.inf for bound in bounds):
+        of_source, of_result, before = math.nan, math.nan, 0
+    if not (0.0 <= of_source < math.inf and 0.0 <= of_result < math.inf):
         raise UsageError(
             "the scene says that it was simplified, and not how far it strays",
             where="metadata",
             remedy="convert the mesh again",
         )
-    return before, *bounds
+    return before, of_source, of_result
 
 
 def own_source(scene: Scene) -> tuple[Scene, Mesh]:
