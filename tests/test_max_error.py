@@ -130,3 +130,11 @@ def test_the_command_line_takes_the_number_as_it_is(tmp_path: Path) -> None:
             assert main(["convert", *files, "--max-error", repr(largest), "--force", "--quiet"]) == 0
             wanted = convert(ball(), Options(precision=PrecisionOptions(there))).grid_exponent
             assert read_scene(tmp_path / "ball.rdm").grid_exponent == wanted
+
+
+@pytest.mark.parametrize(("name", "finer"), [("repeated", 0), ("mirrored", 2), ("nested", 2)])
+def test_instances_take_no_bit_more_than_their_stretch(name: str, finer: int) -> None:
+    """Stretches of 1, 3 and 4: the grid is that of the flattened scene's box, finer by 0, 2 and 2 powers."""
+    mesh = load(SCENES[name])
+    found = quantise(clean(mesh), PrecisionOptions(12)).grid_exponent
+    assert found == quantize.grid_exponent_for(mesh.flattened().bounds, 12) - finer

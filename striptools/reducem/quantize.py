@@ -41,6 +41,9 @@ CHUNK = 1 << 16
 SLACK = 1 + 2.0**-50
 """What float64 may add to a bound or a distance of a few operations."""
 
+STRETCH_SLACK = 2.0**-18
+"""In powers of two, by how much cells may be larger than asked for: `Instances.stretch` is that inexact."""
+
 
 @dataclass(frozen=True)
 class PrecisionOptions:
@@ -245,10 +248,12 @@ def _exponent(mesh: Mesh, precision: PrecisionOptions, already: float) -> int:
 
 
 def _finer(exponent: int, stretch: float) -> int:
-    """The grid whose cells are no larger than another's where instances stretch them."""
-    if stretch == 1.0:
-        return exponent
-    return min(max(exponent - math.frexp(stretch)[1], GRID_EXPONENTS.start), GRID_EXPONENTS.stop - 1)
+    """The grid whose cells are no larger than another's where instances stretch them.
+
+    A stretch has a little on top for rounding, which is no reason for a bit more.
+    """
+    finer = exponent - math.ceil(math.log2(stretch) - STRETCH_SLACK)
+    return min(max(finer, GRID_EXPONENTS.start), GRID_EXPONENTS.stop - 1)
 
 
 def _count_flipped(mesh: Mesh, again: Cleaned) -> int:
