@@ -32,12 +32,10 @@ Bools = Bool[np.ndarray, " n"]
 Doubles = Float64[np.ndarray, " n"]
 Counts = Int32[np.ndarray, " n"]
 Words = UInt32[np.ndarray, " n"]
-Bytes = UInt8[np.ndarray, " n"]
 
 __all__ = [
     "Bools",
     "Boxes",
-    "Bytes",
     "Counts",
     "Doubles",
     "FaceIds",

@@ -1,7 +1,9 @@
 """Settings and fixtures that all tests share."""
 
+import logging
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -37,3 +39,27 @@ def real_mesh() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture
+def restored_logging() -> Iterator[None]:
+    """Put back what a command sets up: handlers, level and filters of warnings."""
+    handlers, level = logging.getLogger().handlers[:], logging.getLogger().level
+    with warnings.catch_warnings():
+        yield
+    logging.captureWarnings(False)
+    logging.getLogger().handlers[:] = handlers
+    logging.getLogger().setLevel(level)
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], restored_logging: None) -> Callable[..., tuple[int, str, str]]:
+    """Run a command in this process: its exit code, standard output and standard error."""
+    from striptools_cli import app
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        code = app.main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from scenes import scene_of, scenes, small_scene
-from strategies import book, cube, fan, grid, soup, sphere, stack
+from shapes import COMMON
+from strategies import grid, sphere
 from test_trace import clean, far_fetched, flushed, named_corners, try_one
 
 from striptools.errors import UsageError
@@ -47,15 +48,12 @@ def ball():
     return scene_of(Mesh(*sphere(3)))
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [grid(20, 20), fan(300), book(26), soup(600, 1, 1000), soup(300, 2, 3), stack(40), cube(), sphere(3)],
-)
+@pytest.mark.parametrize("shape", COMMON.values(), ids=COMMON)
 @pytest.mark.parametrize("resident", ["expanded", "compressed"])
 @pytest.mark.parametrize("remap", [True, False])
 def test_all_hits_equal_trying_every_triangle(shape, resident, remap):
     scene = scene_of(Mesh(*clean(shape)), remap=remap, spare_faces=3 if remap else 0)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 150, 5)
+    origins, directions = rays_at(scene, 150, 5)
     tracer = Tracer(scene, device="cpu", threads=1, resident=resident)
     sure = ~doubted(scene, origins, directions)
     assert sure.mean() > 0.8
@@ -79,7 +77,7 @@ def test_all_hits_equal_trying_every_triangle(shape, resident, remap):
 @given(scenes(), st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 16]))
 def test_any_scene_in_both_residencies(drawn, seed, k):
     _, scene = drawn
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 40, seed)
+    origins, directions = rays_at(scene, 40, seed)
     expanded = Tracer(scene, device="cpu", threads=1, resident="expanded")
     compressed = Tracer(scene, device="cpu", threads=1, resident="compressed")
     closest = expanded.closest_hit(origins, directions)
@@ -95,7 +93,7 @@ def test_any_scene_in_both_residencies(drawn, seed, k):
 
 @pytest.mark.parametrize("k", [1, 2, 3, 40])
 def test_more_hits_asked_for_only_go_on(k, ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 500, 1)
+    origins, directions = rays_at(ball, 500, 1)
     tracer = Tracer(ball, device="cpu", threads=1)
     few, many = tracer.all_hits(origins, directions, k=k), tracer.all_hits(origins, directions, k=64)
     for name in COLUMNS[:-1]:
@@ -128,7 +126,7 @@ def test_only_hits_before_t_max_are_listed_and_counted(ball):
 
 
 def test_all_threads_and_the_rebuilt_hierarchy_give_the_same(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 3001, 4)
+    origins, directions = rays_at(ball, 3001, 4)
     expected = Tracer(ball, device="cpu", threads=1).all_hits(origins, directions, k=5)
     for options in ({}, {"hierarchy": "rebuilt"}, {"resident": "compressed"}):
         other = Tracer(ball, device="cpu", **options).all_hits(origins, directions, k=5)

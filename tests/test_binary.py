@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from scenes import scene_of, scenes, small_scene
-from strategies import book, cube, fan, grid, line, soup, sphere, stack, tangle
-from test_hoisting import loops_outside_hoisted_calls
+from shapes import COMMON
+from strategies import cube, grid, line, sphere, tangle
+from test_hoisting import assert_hoisted
 from test_trace import clean, far_fetched
 
 from striptools.errors import StriptoolsError
@@ -50,34 +51,21 @@ def assert_same(scene, other, origins, directions, t_max=np.inf):
 @given(scenes(), st.sampled_from(OVER), st.sampled_from(BUILDERS), st.integers(0, 2**32 - 1))
 def test_hits_are_those_of_the_default_walk(drawn, over, build, seed):
     _, scene = drawn
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 64, seed)
+    origins, directions = rays_at(scene, 64, seed)
     assert_same(scene, under(scene, over, build), origins, directions)
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        grid(20, 20),
-        fan(300),
-        book(26),
-        soup(600, 1, 1000),
-        soup(300, 2, 3),
-        stack(40),
-        cube(),
-        sphere(3),
-        tangle(12, 80, 4),
-    ],
-)
+@pytest.mark.parametrize("shape", [*COMMON.values(), tangle(12, 80, 4)])
 @pytest.mark.parametrize("over", OVER)
 def test_hits_of_every_shape(shape, over):
     scene = scene_of(Mesh(*clean(shape)), spare_faces=3, block=16)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 300, 5)
+    origins, directions = rays_at(scene, 300, 5)
     assert assert_same(scene, under(scene, over), origins, directions).sum() > 50
 
 
 def test_hits_nearer_than_a_limit():
     scene = scene_of(Mesh(*sphere(2)))
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 300, 6)
+    origins, directions = rays_at(scene, 300, 6)
     reach = np.random.default_rng(1).exponential(1.0, 300).astype(np.float32)
     hit = assert_same(scene, under(scene), origins, directions, t_max=reach)
     assert 0 < hit.sum() < 300
@@ -87,7 +75,7 @@ def test_a_scene_of_one_leaf_or_one_triangle():
     for shape in (cube(), (sphere(0)[0][:3], np.array([[0, 1, 2]], np.int32)), line(1)):
         mesh = Mesh(shape[0], shape[1][:8])
         scene = scene_of(mesh)
-        origins, directions = aimed_rays(scene.positions, scene.faces(), 64, 7)
+        origins, directions = rays_at(scene, 64, 7)
         for over in ("triangles", "blocks"):
             assert_same(scene, under(scene, over), origins, directions)
 
@@ -98,7 +86,7 @@ def ball():
 
 
 def test_counters_say_what_was_done(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 200, 8)
+    origins, directions = rays_at(ball, 200, 8)
     for over in OVER:
         hits = Tracer(under(ball, over), device="cpu", threads=1).closest_hit(
             origins, directions, counters=True
@@ -136,7 +124,7 @@ def test_what_waits_is_left_out_once_it_is_too_far():
 
 def test_walking_all_rays_at_once_gives_the_same(ball):
     scene = under(ball)
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 200, 6)
+    origins, directions = rays_at(ball, 200, 6)
     tracer = Tracer(scene, device="cpu", threads=1)
     expected = tracer.closest_hit(origins, directions, counters=True)
     options = WalkOptions(1, any_hit=False, counting=True, stack_size=16, batch=True)
@@ -158,9 +146,7 @@ def test_the_walk_is_hoisted(any_hit, counting):
     tracer = Tracer(under(small_scene(), leaf_size=1), device="cpu")
     options = tracer._options(any_hit=any_hit, counting=counting)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
-    text = program(tracer._mesh, options).lower(tracer._scene, rays).compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(program(tracer._mesh, options).lower(tracer._scene, rays))
 
 
 def test_a_walk_in_circles_ends(ball):

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,17 +25,7 @@ COMMAND = [str(Path(sys.executable).parent / "striptools")]
 FULL_DISK = Path("/dev/full")
 
 
-@pytest.fixture(autouse=True)
-def _restored_logging() -> Iterator[None]:
-    import logging
-    import warnings
-
-    handlers, level = logging.getLogger().handlers[:], logging.getLogger().level
-    with warnings.catch_warnings():
-        yield
-    logging.captureWarnings(False)
-    logging.getLogger().handlers[:] = handlers
-    logging.getLogger().setLevel(level)
+pytestmark = pytest.mark.usefixtures("restored_logging")
 
 
 @pytest.fixture(scope="module")
@@ -49,18 +38,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     striptools.save_mesh(mesh, folder / "torus.ply")
     striptools.convert(mesh).save(folder / "torus.rdm")
     return folder
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Run a command in this process: its exit code, standard output and standard error."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        code = app.main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 def run_process(

@@ -1,7 +1,6 @@
 """`striptools convert --strips`: what it writes, what it says, what it refuses."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import trimesh
 from strategies import sphere
 
 import striptools
-from striptools_cli import app
 
 
 @pytest.fixture(scope="module")
@@ -21,16 +19,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     striptools.save_mesh(mesh, folder / "ball.ply")
     striptools.convert(mesh).save(folder / "ball.rdm")
     return folder
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        code = app.main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 def corners(positions: np.ndarray, faces: np.ndarray) -> list[list[list[float]]]:

@@ -1,21 +1,18 @@
 """The closest point: within its bound of trying every triangle in float64, the same in each residency."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scenes import scene_of, scenes, small_scene
 from strategies import book, cube, fan, grid, soup, sphere, stack
-from test_hoisting import loops_outside_hoisted_calls
-from test_trace import clean
+from test_hoisting import assert_hoisted
+from test_trace import clean, going_round
 
 from striptools.errors import StriptoolsError, UsageError
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 from striptools.trace.closest import program
-from striptools.trace.walk import DONE
 from striptools.trace.walk_points import PointOptions
 
 BOUND = 2.0**-20
@@ -172,12 +169,7 @@ def test_points_that_are_none_have_none_and_wrong_arguments_are_told():
 
 
 def test_a_tree_that_goes_round_ends_and_is_told():
-    tracer = Tracer(small_scene(), device="cpu", threads=1)
-    layout = tracer._layout
-    nodes = layout.arrays.nodes.copy()
-    children = nodes[0, 6].view(np.int32)
-    children[children != DONE] = 0
-    tracer._take(replace(layout, arrays=layout.arrays._replace(nodes=nodes)))
+    tracer = going_round()
     with pytest.raises(StriptoolsError, match="did not end"):
         tracer.closest_point(np.zeros((4, 3)))
 
@@ -187,6 +179,4 @@ def test_the_walk_is_hoisted(resident):
     tracer = Tracer(small_scene(), device="cpu", resident=resident)
     options = PointOptions(tracer._stack_size, False, tracer._layout.decode)
     points = np.zeros((256 * len(tracer.devices), 4), np.float32)
-    text = program(tracer._mesh, options).lower(tracer._scene, points).compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(program(tracer._mesh, options).lower(tracer._scene, points))

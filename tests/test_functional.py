@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import scene_of
 from strategies import cube, sphere
-from test_hoisting import loops_outside_hoisted_calls
+from test_hoisting import assert_hoisted
 from test_trace import clean
 
 from striptools.errors import UsageError
@@ -110,9 +110,7 @@ def test_the_loop_stays_hoisted_inside_a_program(geometry):
         jax.jit(jax.vmap(one)).lower(origins, directions),
         jax.jit(jax.grad(loss, argnums=(0, 1, 2))).lower(POSITIONS, origins, directions),
     ):
-        text = program.compile().as_text()
-        assert 'xla_cpu_small_call="true"' in text
-        assert loops_outside_hoisted_calls(text) == []
+        assert_hoisted(program)
 
 
 # ---- Derivatives.

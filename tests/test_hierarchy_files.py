@@ -25,7 +25,6 @@ from striptools.reducem.reader import open_scene, read_scene
 from striptools.reducem.scene import empty_scene
 from striptools.reducem.stored_hierarchy import items_of, name_of, over_of
 from striptools.reducem.validate import validate
-from striptools_cli import app
 
 ALL = [HierarchyOptions(name, over) for name, overs in OVER.items() if name != "reducem" for over in overs]
 NONE = PackedNodes(np.zeros((0, 16), np.uint32), 0, None, None, 0)
@@ -385,19 +384,6 @@ def test_instances_are_flattened_with_a_word(chairs):
     assert convert(chairs, Options(threads=1)).instances is not None
 
 
-@pytest.fixture(autouse=True)
-def _restored_logging():
-    import logging
-    import warnings
-
-    handlers, level = logging.getLogger().handlers[:], logging.getLogger().level
-    with warnings.catch_warnings():
-        yield
-    logging.captureWarnings(False)
-    logging.getLogger().handlers[:] = handlers
-    logging.getLogger().setLevel(level)
-
-
 @pytest.fixture(scope="module")
 def bowl(tmp_path_factory):
     path = tmp_path_factory.mktemp("bowl") / "bowl.ply"
@@ -405,18 +391,13 @@ def bowl(tmp_path_factory):
     return path
 
 
-def call(capsys, *arguments):
-    code = app.main([str(argument) for argument in arguments])
-    return code, *capsys.readouterr()
-
-
 @pytest.mark.parametrize("options", ALL, ids=title)
-def test_each_goes_through_the_command_line(options, bowl, tmp_path, capsys):
+def test_each_goes_through_the_command_line(options, bowl, tmp_path, run):
     file, back = tmp_path / "a.rdm", tmp_path / "back.ply"
     over = [] if options.name == "presorted" else ["--over", options.objects]
-    assert call(capsys, "convert", bowl, file, "--hierarchy", options.name, *over, "-q")[0] == 0
-    assert call(capsys, "validate", file)[0] == 0
-    code, out, _ = call(capsys, "info", file, "--format", "json")
+    assert run("convert", bowl, file, "--hierarchy", options.name, *over, "-q")[0] == 0
+    assert run("validate", file)[0] == 0
+    code, out, _ = run("info", file, "--format", "json")
     assert code == 0
     facts = json.loads(out)
     found = facts["hierarchy"]
@@ -425,20 +406,20 @@ def test_each_goes_through_the_command_line(options, bowl, tmp_path, capsys):
     assert found["bytes_per_triangle"] == pytest.approx(found["bytes"] / 13)
     assert sum(facts["bytes"].values()) == 2 * file.stat().st_size
     assert (facts["bytes"]["triangles"] > 0) == (options.name == "presorted")
-    assert call(capsys, "convert", file, back, "-q")[0] == 0
+    assert run("convert", file, back, "-q")[0] == 0
     np.testing.assert_array_equal(corners(striptools.load_mesh(back)), corners(striptools.load_mesh(bowl)))
 
 
 @pytest.mark.parametrize("name", [name for name in OVER if name != "reducem"])
-def test_each_is_traced_proved_and_drawn(name, bowl, tmp_path, capsys):
+def test_each_is_traced_proved_and_drawn(name, bowl, tmp_path, run):
     pytest.importorskip("jax")
     file = tmp_path / "a.rdm"
-    assert call(capsys, "convert", bowl, file, "--hierarchy", name, "-q")[0] == 0
+    assert run("convert", bowl, file, "--hierarchy", name, "-q")[0] == 0
     few = ["--rays", 32, "--aimed-rays", 64, "--threads", 1]
-    code, out, _ = call(capsys, "verify", file, "--against", bowl, *few)
+    code, out, _ = run("verify", file, "--against", bowl, *few)
     assert (code, ": proved," in out) == (0, True)
     picture = ["--width", 16, "--height", 16, "--shading", "strip", "--threads", 1, "-q"]
-    assert call(capsys, "render", file, tmp_path / "a.png", *picture)[0] == 0
+    assert run("render", file, tmp_path / "a.png", *picture)[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -456,15 +437,15 @@ def test_each_is_traced_proved_and_drawn(name, bowl, tmp_path, capsys):
         (["--hierarchy", "presorted", "--levels", "21"], "levels"),
     ],
 )
-def test_what_a_hierarchy_has_no_use_for_is_a_usage_error(arguments, said, bowl, tmp_path, capsys):
-    code, _, err = call(capsys, "convert", bowl, tmp_path / "a.rdm", *arguments)
+def test_what_a_hierarchy_has_no_use_for_is_a_usage_error(arguments, said, bowl, tmp_path, run):
+    code, _, err = run("convert", bowl, tmp_path / "a.rdm", *arguments)
     assert (code, said in err) == (2, True), err
     assert not (tmp_path / "a.rdm").exists()
 
 
-def test_a_default_scene_says_its_hierarchy_too(bowl, tmp_path, capsys):
-    assert call(capsys, "convert", bowl, tmp_path / "a.rdm", "-q")[0] == 0
-    facts = json.loads(call(capsys, "info", tmp_path / "a.rdm", "--format", "json")[1])
+def test_a_default_scene_says_its_hierarchy_too(bowl, tmp_path, run):
+    assert run("convert", bowl, tmp_path / "a.rdm", "-q")[0] == 0
+    facts = json.loads(run("info", tmp_path / "a.rdm", "--format", "json")[1])
     assert facts["hierarchy"]["name"] == "reducem"
     assert facts["boxes"] == "rebuilt"
     assert facts["bytes"]["hierarchy"] == 0

@@ -31,6 +31,14 @@ def loops_outside_hoisted_calls(text):
     return outside
 
 
+def assert_hoisted(lowered, loops=0):
+    """A lowered program has at least so many loops, and each is a call of its own."""
+    text = lowered.compile().as_text()
+    assert 'xla_cpu_small_call="true"' in text
+    assert len(re.findall(r"= [^\n]* while\(", text)) >= loops
+    assert loops_outside_hoisted_calls(text) == []
+
+
 def scene_under(hierarchy):
     scene = small_scene()
     if hierarchy == "slbvh":
@@ -44,12 +52,11 @@ def scene_under(hierarchy):
     return scene
 
 
-def compiled_text(hierarchy="reducem", resident="auto", **asked):
+def lowered_walk(hierarchy="reducem", resident="auto", **asked):
     tracer = Tracer(scene_under(hierarchy), device="cpu", resident=resident)
     options = tracer._options(**asked)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
-    lowered = program(tracer._mesh, options).lower(tracer._scene, rays)
-    return lowered.compile().as_text()
+    return program(tracer._mesh, options).lower(tracer._scene, rays)
 
 
 GATHERING = [
@@ -67,10 +74,7 @@ OTHERS = [
 
 @pytest.mark.parametrize("asked", [{}, {"any_hit": True}, {"counting": True}, *GATHERING, *OTHERS])
 def test_walks_are_hoisted(asked):
-    text = compiled_text(**asked)
-    assert 'xla_cpu_small_call="true"' in text
-    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(lowered_walk(**asked), loops=3)
 
 
 @pytest.mark.parametrize("resident", ["expanded", "compressed"])
@@ -81,10 +85,7 @@ def test_the_walk_over_instances_is_hoisted(any_hit, counting, resident):
     options = tracer._options(any_hit=any_hit, counting=counting)
     rays = np.zeros((256 * len(tracer.devices), 3), np.float32)
     lowered = instances_program(tracer._mesh, options).lower(tracer._scene, rays, rays, rays[:, 0])
-    text = lowered.compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert len(re.findall(r"= [^\n]* while\(", text)) >= 5
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(lowered, loops=5)
 
 
 def test_a_loop_that_is_not_hoisted_would_be_seen():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from scenes import scene_of, scenes, small_scene
 from strategies import clean_meshes, cube, grid, line, sphere, stack
 from test_trace import far_fetched
@@ -416,7 +416,7 @@ def sure_of(scene, origins, directions, *hits):
 )
 def test_hits_are_those_of_the_default_walk(drawn, seed, over, metric, mailbox):
     _, scene = drawn
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 400, seed)
+    origins, directions = rays_at(scene, 400, seed)
     tree, _, _ = tree_of(scene, metric, over, constants=KdCosts(intersection=2.0))
     expected = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
     hits = traced(scene, replace(tree, mailbox=mailbox), origins, directions)
@@ -426,7 +426,7 @@ def test_hits_are_those_of_the_default_walk(drawn, seed, over, metric, mailbox):
 @pytest.mark.parametrize("over", ["triangles", "strips"])
 def test_every_mailbox_gives_the_same_hits_and_larger_ones_test_less(over):
     scene = scene_of(Mesh(*sphere(3)), max_length=6)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 3000, 1)
+    origins, directions = rays_at(scene, 3000, 1)
     tree, _, _ = tree_of(scene, over=over)
     expected = Tracer(scene, device="cpu", threads=1)
     hits = [traced(scene, replace(tree, mailbox=size), origins, directions) for size in MAILBOXES]
@@ -516,7 +516,7 @@ def test_walking_all_rays_at_once_gives_the_same():
     scene = small_scene()
     tree, _, _ = tree_of(scene)
     layout = lay_out_kdtree(scene, tree)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 64, 3)
+    origins, directions = rays_at(scene, 64, 3)
     t_max = np.full(64, np.inf, np.float32)
     options = WalkOptions(1, any_hit=False, counting=True, stack_size=16)
     one = trace_rays(layout.arrays, origins, directions, t_max, options)

@@ -1,14 +1,14 @@
 """Rays in packets: the hits of rays on their own, bit for bit, and the kernel that puts them together."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
+from test_hoisting import assert_hoisted
 
 import striptools
 from striptools.errors import StriptoolsError
@@ -161,7 +161,7 @@ def test_rays_that_are_none_and_rays_that_go_elsewhere():
 
 def test_incoherent_rays_go_alone():
     scene = scene_of(Mesh(*sphere(3)))
-    rays = aimed_rays(scene.positions, scene.faces(), 3000, 8)
+    rays = rays_at(scene, 3000, 8)
     assert_same(scene, (*rays, None), "expanded")
     assert packets_of(scene, *rays)[0] < 10
 
@@ -233,15 +233,7 @@ def test_the_walk_is_hoisted(resident, any_hit):
     lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), True).lower(
         tracer._scene, np.zeros((8, ROW), np.float32)
     )
-    text = lowered.compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    name, outside = "", []
-    for line in text.splitlines():
-        if started := re.match(r"(?:ENTRY )?%?(\S+) ", line):
-            name = started.group(1)
-        if " while(" in line and not re.match(r"while\S*_computation", name):
-            outside.append(name)
-    assert outside == []
+    assert_hoisted(lowered)
 
 
 def test_a_tree_without_end_is_stuck_and_no_hang():

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
-from rays import aimed_rays
+from rays import rays_at
 from scenes import scene_of, small_scene
 
 from striptools.hierarchies.options import HierarchyOptions
@@ -25,7 +25,7 @@ COUNT = 64
 
 def odd_rays(scene, count=COUNT, seed=1):
     """Aimed rays, some with a reach of one, some that are none, and some from very far or far too far."""
-    origins, directions = aimed_rays(scene.positions, scene.faces(), count, seed)
+    origins, directions = rays_at(scene, count, seed)
     reach = np.full(count, np.inf, np.float32)
     reach[::3] = 1
     reach[1], reach[4] = np.nan, 0
@@ -213,7 +213,7 @@ def test_the_kernel_only_walks_what_it_can():
 
 def test_hits_are_weighed_by_many_threads_alike(monkeypatch):
     scene = small_scene()
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 1000, 3)
+    origins, directions = rays_at(scene, 1000, 3)
     tracer = Tracer(scene, device="cpu", threads=1)
     wanted = tracer.closest_hit(origins, directions)
     tracer._weighers = 3

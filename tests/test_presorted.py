@@ -2,16 +2,16 @@
 
 import dataclasses
 import io
-import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
-from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
-from test_hoisting import loops_outside_hoisted_calls
+from rays import axial_rays, far_rays, rays_at, rays_from_inside
+from shapes import SHAPES, THIN, UNITS, moved_sphere
+from strategies import clean_meshes, cube, sphere, stack
+from test_hoisting import assert_hoisted
 
 import striptools
 from striptools.errors import LimitError, StriptoolsError, UnreadableSceneError, UsageError
@@ -40,6 +40,7 @@ from striptools.trace import presorted as layouts
 from striptools.trace.launch import program
 from striptools.trace.presorted import lay_out_presorted
 
+ALL_SHAPES = {**SHAPES, "thin": THIN}
 FIELDS = ("t", "face", "u", "v")
 NODE_TESTS = ("bandwidth", "direct")
 
@@ -303,10 +304,6 @@ def assert_same(scene, origins, directions, levels=0, t_max=None, node_tests=NOD
     return expected
 
 
-def rays_at(scene, count, seed):
-    return aimed_rays(scene.positions, scene.faces(), count, seed)
-
-
 @settings(max_examples=8)
 @given(clean_meshes(), st.integers(0, 2**32 - 1), st.booleans(), levels_drawn)
 def test_any_mesh_has_the_same_hits(mesh, seed, remap, levels):
@@ -321,36 +318,17 @@ def test_any_mesh_has_the_same_hits(mesh, seed, remap, levels):
     assert_same(scene, *rays_at(scene, 60, seed), levels)
 
 
-SHAPES = {
-    "one triangle": (np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.int32([[0, 1, 2]])),
-    "planar": grid(20, 20),
-    "fan": fan(300),
-    "pages on an edge": book(26),
-    "soup": soup(600, 1, 1000),
-    "coincident soup": soup(300, 2, 3),
-    "copies": stack(40),
-    "cube": cube(),
-    "closed": sphere(4),
-    "tangle": tangle(12, 80, 3),
-    "thin": (sphere(3)[0] * np.float32([1, 1e-6, 1]), sphere(3)[1]),
-}
-
-
 @pytest.mark.parametrize("levels", [0, 3])
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", ALL_SHAPES)
 def test_shapes_have_the_same_hits(shape, levels):
-    scene = scene_of(clean(Mesh(*SHAPES[shape])).mesh)
+    scene = scene_of(clean(Mesh(*ALL_SHAPES[shape])).mesh)
     hits = assert_same(scene, *rays_at(scene, 600, 5), levels)
     assert hits.hit.sum() > 50
 
 
-@pytest.mark.parametrize(
-    ("scale", "offset"), [(2.0**-126, 0), (2.0**-120, 1), (1e-8, 0), (1, 1e4), (2.0**120, 0), (2.0**100, 1e4)]
-)
+@pytest.mark.parametrize(("scale", "offset"), UNITS)
 def test_units_and_offsets_have_the_same_hits(scale, offset):
-    positions, faces = sphere(3)
-    moved = ((positions.astype(np.float64) + offset) * scale).astype(np.float32)
-    scene = scene_of(clean(Mesh(moved, faces)).mesh)
+    scene = scene_of(clean(Mesh(*moved_sphere(scale, offset))).mesh)
     for levels in (0, 4):
         assert_same(scene, *rays_at(scene, 400, 7), levels)
 
@@ -362,11 +340,7 @@ def ball():
 
 @pytest.mark.parametrize("distance", [1e2, 1e4, 1e6])
 def test_far_origins_have_the_same_hits(ball, distance):
-    random = np.random.default_rng(5)
-    towards = random.normal(size=(3000, 3))
-    origins = (towards / np.linalg.norm(towards, axis=1, keepdims=True) * distance).astype(np.float32)
-    targets = ball.positions[random.integers(0, len(ball.positions), len(origins))]
-    hits = assert_same(ball, origins, (targets - origins).astype(np.float32), 2)
+    hits = assert_same(ball, *far_rays(ball, distance), 2)
     assert hits.hit.mean() > 0.3
 
 
@@ -379,23 +353,14 @@ def test_limits_of_t_are_the_same(ball):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_rays_along_axes_in_the_planes_of_slabs(axis):
     scene = scene_of(clean(Mesh(*cube())).mesh)
-    lattice = np.array([[i, j] for i in (0, 0.25, 0.5, 1) for j in (0, 0.25, 0.5, 1)], np.float32)
     for sign in (1.0, -1.0):
-        origins = np.full((len(lattice), 3), -5.0 * sign, np.float32)
-        origins[:, [k for k in range(3) if k != axis]] = lattice
-        directions = np.zeros_like(origins)
-        directions[:, axis] = sign
+        origins, directions, _ = axial_rays(axis, sign)
         for levels in (0, 2):
             assert assert_same(scene, origins, directions, levels).hit.all()
 
 
 def test_no_ray_leaves_a_closed_sphere(ball):
-    positions, faces = ball.positions, ball.faces()
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    targets = np.concatenate([positions[edges].astype(np.float64).mean(axis=1), positions])
-    origin = np.float32([0.1, -0.2, 0.15])
-    directions = (targets - origin).astype(np.float32)
-    assert assert_same(ball, np.broadcast_to(origin, directions.shape), directions).hit.all()
+    assert assert_same(ball, *rays_from_inside(ball)).hit.all()
 
 
 @pytest.mark.parametrize("levels", [0, 10])
@@ -436,10 +401,7 @@ def test_walks_are_hoisted(ball, node_test, any_hit, count):
     tracer = tracer_of(ball, 3, node_test)
     given_options = tracer._options(any_hit=any_hit, counting=count)
     lowered = program(tracer._mesh, given_options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
-    text = lowered.compile().as_text()
-    assert 'xla_cpu_small_call="true"' in text
-    assert len(re.findall(r"= [^\n]* while\(", text)) >= 3
-    assert loops_outside_hoisted_calls(text) == []
+    assert_hoisted(lowered, loops=3)
 
 
 def test_nodes_that_go_round_end(ball):

@@ -462,43 +462,45 @@ def test_numbers_of_every_width_come_back(count, rows, seed):
 # ------------------------------------------------------------------------------------- the command line
 
 
-def run(capsys, *arguments):
-    """The exit code of a command, and what it wrote."""
-    from striptools_cli.app import main
+@pytest.fixture
+def told(run):
+    """Run a command that succeeds: all that it writes."""
 
-    code = main([str(argument) for argument in arguments])
-    written = capsys.readouterr()
-    assert code == 0, written.err
-    return written.out + written.err
+    def call(*arguments):
+        code, out, err = run(*arguments)
+        assert code == 0, err
+        return out + err
+
+    return call
 
 
-def test_the_command_line_keeps_attributes_or_says_what_it_leaves_out(tmp_path, capsys):
+def test_the_command_line_keeps_attributes_or_says_what_it_leaves_out(tmp_path, told):
     mesh = with_attributes(Mesh(*sphere(1)), 3, domains={"color": "vertex"})
     save_mesh(mesh, tmp_path / "a.ply")
-    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "a.rdm", "-v")
+    said = told("convert", tmp_path / "a.ply", tmp_path / "a.rdm", "-v")
     assert "  attributes " in said
-    facts = json.loads(run(capsys, "info", tmp_path / "a.rdm", "--format", "json"))
+    facts = json.loads(told("info", tmp_path / "a.rdm", "--format", "json"))
     assert set(facts["attributes"]) == {"normal", "texcoord", "color"}
     assert facts["bytes"]["attributes"] > sum(one["bytes"] for one in facts["attributes"].values())
-    assert "left out" not in run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "b.ply")
-    said = run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "b.stl")
+    assert "left out" not in told("convert", tmp_path / "a.rdm", tmp_path / "b.ply")
+    said = told("convert", tmp_path / "a.rdm", tmp_path / "b.stl")
     assert "left out: normals, texcoords, colors" in said
-    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "g.rdm", "--geometry-only")
+    said = told("convert", tmp_path / "a.ply", tmp_path / "g.rdm", "--geometry-only")
     assert "left out: normals, texcoords, colors" in said
-    facts = json.loads(run(capsys, "info", tmp_path / "g.rdm", "--format", "json"))
+    facts = json.loads(told("info", tmp_path / "g.rdm", "--format", "json"))
     assert "attributes" not in facts
-    said = run(capsys, "convert", tmp_path / "a.rdm", tmp_path / "s.glb", "--strips")
+    said = told("convert", tmp_path / "a.rdm", tmp_path / "s.glb", "--strips")
     assert "left out: normals, texcoords, colors" in said
 
 
-def test_the_command_line_says_where_an_origin_is(tmp_path, capsys):
+def test_the_command_line_says_where_an_origin_is(tmp_path, told):
     save_mesh(survey(), tmp_path / "a.ply")
-    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "a.rdm")
+    said = told("convert", tmp_path / "a.ply", tmp_path / "a.rdm")
     assert "moved to an origin at (450560, 5400576, 300.5), in whose frame rays are traced" in said
-    facts = json.loads(run(capsys, "info", tmp_path / "a.rdm", "--format", "json"))
+    facts = json.loads(told("info", tmp_path / "a.rdm", "--format", "json"))
     assert facts["origin"] == [450560, 5400576, 300.5]
     assert facts["precision"]["kind"] == "recentred"
-    said = run(capsys, "convert", tmp_path / "a.ply", tmp_path / "b.rdm", "--recentre", "never")
+    said = told("convert", tmp_path / "a.ply", tmp_path / "b.rdm", "--recentre", "never")
     assert "origin" not in said
-    run(capsys, "convert", tmp_path / "a.ply", tmp_path / "s.ply", "--strips")
+    told("convert", tmp_path / "a.ply", tmp_path / "s.ply", "--strips")
     np.testing.assert_allclose(load_mesh(tmp_path / "s.ply").bounds, survey().bounds, atol=1.0)

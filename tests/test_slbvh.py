@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import rays_at
 from scenes import scene_of, scenes, small_scene
-from strategies import book, cube, fan, grid, soup, sphere, stack, tangle
+from shapes import SHAPES
+from strategies import sphere
 
 import striptools
 from striptools.errors import LimitError, StriptoolsError, UnreadableSceneError, UsageError
@@ -337,19 +338,7 @@ def test_the_trail_reaches_depth_30(side, near):
 
 # ---- The walk.
 
-MESHES = {
-    "one triangle": (np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.int32([[0, 1, 2]])),
-    "planar": grid(20, 20),
-    "fan": fan(300),
-    "pages on an edge": book(26),
-    "soup": soup(600, 1, 1000),
-    "coincident soup": soup(300, 2, 3),
-    "copies": stack(40),
-    "cube": cube(),
-    "closed": sphere(4),
-    "tangle": tangle(12, 80, 3),
-    "far away": (sphere(3)[0] + np.float32(1e4), sphere(3)[1]),
-}
+MESHES = {**SHAPES, "far away": (sphere(3)[0] + np.float32(1e4), sphere(3)[1])}
 
 
 def scene_named(name, block=16):
@@ -370,7 +359,7 @@ def assert_same_hits(scene, other, origins, directions, t_max=None):
 @pytest.mark.parametrize("name", MESHES)
 def test_hits_are_those_of_the_default_walk(name, balance, over):
     scene = scene_named(name)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 400, 3)
+    origins, directions = rays_at(scene, 400, 3)
     hits = assert_same_hits(scene, under(scene, over, balance), origins, directions)
     assert hits.hit.any()
     t_max = np.where(hits.hit, hits.t, 1) * np.float32(1.0)
@@ -381,7 +370,7 @@ def test_hits_are_those_of_the_default_walk(name, balance, over):
 @given(scenes(), st.sampled_from(OVERS), st.sampled_from(BALANCES), st.integers(0, 2**32 - 1))
 def test_any_mesh_has_the_same_hits(case, over, balance, seed):
     scene = case[1]
-    rays = aimed_rays(scene.positions, scene.faces(), 60, seed)
+    rays = rays_at(scene, 60, seed)
     assert_same_hits(scene, under(scene, over, balance), *rays)
 
 
@@ -430,7 +419,7 @@ def trail_of(arrays, ray):
 @pytest.mark.parametrize("balance", BALANCES)
 def test_visits_are_those_of_a_recursion_near_child_first(name, balance):
     scene = under(scene_named(name), "triangles", balance, largest_leaf=3)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 12, 8)
+    origins, directions = rays_at(scene, 12, 8)
     counted = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions, counters=True).counters
     arrays = jax.tree.map(jnp.asarray, lay_out_slbvh(scene, scene.hierarchy).arrays)
     t_max = np.full(len(origins), np.inf, np.float32)
@@ -459,7 +448,7 @@ def leaf_at(scene, leaf):
 def test_a_walk_that_goes_to_the_far_child_first_would_be_seen():
     scene = under(scene_named("closed"), "triangles", "sah")
     arrays = jax.tree.map(jnp.asarray, lay_out_slbvh(scene, scene.hierarchy).arrays)
-    rays = aimed_rays(scene.positions, scene.faces(), 4, 8)
+    rays = rays_at(scene, 4, 8)
     rows = prepared_rays(arrays, *rays, np.full(4, np.inf, np.float32))
     assert any(trail_of(arrays, ready_ray(row)) != Twin(arrays, ready_ray(row), True).visited for row in rows)
 
@@ -516,7 +505,7 @@ def test_all_rays_at_once_have_the_same_hits_and_visits(name):
     """As a GPU walks them: by vmap."""
     scene = under(scene_named(name), "triangles", "sah")
     arrays = jax.tree.map(jnp.asarray, lay_out_slbvh(scene, scene.hierarchy).arrays)
-    rays = aimed_rays(scene.positions, scene.faces(), 64, 5)
+    rays = rays_at(scene, 64, 5)
     ready = prepared_rays(arrays, *rays, np.full(64, np.inf, np.float32)).at[7].set(0)
     one_by_one, at_once = (
         jax.jit(SlbvhScene.walk_rays, static_argnums=2)(
@@ -544,6 +533,6 @@ def test_a_heap_without_end_is_stuck_and_no_hang():
 @pytest.mark.parametrize("name", ["bunny", "cad_frame"])
 def test_real_meshes_have_the_same_hits(name, real_mesh):
     scene = striptools.convert(real_mesh(name))
-    rays = aimed_rays(scene.positions, scene.faces(), 3000, 1)
+    rays = rays_at(scene, 3000, 1)
     for balance in BALANCES:
         assert_same_hits(scene, under(scene, "triangles", balance), *rays)

@@ -18,7 +18,6 @@ from striptools.measure.study import PAPER, Study, StudyOptions, paper_range, st
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options
 from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions
-from striptools_cli import app
 from striptools_cli.study import printed
 
 QUICK = StudyOptions(Options(ordering=OrderingOptions(32)), side=16, runs=2)
@@ -149,42 +148,24 @@ def ball(mesh: Mesh, tmp_path: Path) -> Path:
     return tmp_path / "ball.ply"
 
 
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = app.main([str(argument) for argument in arguments])
-    return code, *capsys.readouterr()
-
-
-def test_study_prints_json_and_writes_plot_and_table(ball: Path, capsys, restored_logging) -> None:
+def test_study_prints_json_and_writes_plot_and_table(ball: Path, run) -> None:
     pytest.importorskip("matplotlib", reason="the extra plots is not installed")
     out = ball.parent / "new" / "folder"
     options = ["--side", 16, "--runs", 1, "--max-length", 32, "--out", out, "--format", "json", "--quiet"]
-    code, printed_, err = call(capsys, "study", "strips", ball, *options)
+    code, printed_, err = run("study", "strips", ball, *options)
     assert (code, err) == (0, "")
     assert json.loads(printed_)["rows"][1]["variant"] == "paper"
     assert sorted(path.name for path in out.iterdir()) == ["ball-strips.csv", "ball-strips.png"]
 
 
-def test_study_refuses_before_it_works(ball: Path, capsys, monkeypatch, restored_logging) -> None:
-    assert call(capsys, "study", "colours", ball)[0] == 2
-    assert call(capsys, "study", "strips", ball, "--side", 4)[0] == 2
-    assert call(capsys, "study", "strips", ball.parent / "no.ply")[0] == 3
-    code, _, err = call(capsys, "study", "strips", ball, "--out", ball)
+def test_study_refuses_before_it_works(ball: Path, run, monkeypatch) -> None:
+    assert run("study", "colours", ball)[0] == 2
+    assert run("study", "strips", ball, "--side", 4)[0] == 2
+    assert run("study", "strips", ball.parent / "no.ply")[0] == 3
+    code, _, err = run("study", "strips", ball, "--out", ball)
     assert (code, "is no folder" in err) == (2, True)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    code, printed_, err = call(capsys, "study", "strips", ball, "--out", ball.parent / "new")
+    code, printed_, err = run("study", "strips", ball, "--out", ball.parent / "new")
     assert (code, printed_) == (2, "")
     assert "striptools[plots]" in err
     assert not (ball.parent / "new").exists()
-
-
-@pytest.fixture
-def restored_logging():
-    import logging
-    import warnings
-
-    handlers, level = logging.getLogger().handlers[:], logging.getLogger().level
-    with warnings.catch_warnings():
-        yield
-    logging.captureWarnings(False)
-    logging.getLogger().handlers[:] = handlers
-    logging.getLogger().setLevel(level)

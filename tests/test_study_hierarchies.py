@@ -20,7 +20,6 @@ from striptools.mesh.mesh import Mesh
 from striptools.partition.sah import expected_cost
 from striptools.pipeline import Options
 from striptools.reducem.check_hierarchy import cells_of
-from striptools_cli import app
 from striptools_cli.study import printed_tables
 
 pytest.importorskip("jax", reason="the extra trace is not installed")
@@ -156,14 +155,13 @@ def test_it_is_printed_in_every_shape(found):
     assert printed_tables(tables, "md", "ball").count("\n|") == len(rows) + 2
 
 
-def test_the_verb_prints_it_and_writes_table_and_picture(found, monkeypatch, tmp_path, capsys):
+def test_the_verb_prints_it_and_writes_table_and_picture(found, monkeypatch, tmp_path, run):
     pytest.importorskip("matplotlib", reason="the extra plots is not installed")
     monkeypatch.setattr(study_hierarchies, "study", lambda *_, **__: found)
     striptools.save_mesh(ball(4), tmp_path / "ball.ply")
-    arguments = ["study", "hierarchies", tmp_path / "ball.ply", "--out", tmp_path, "--format", "json", "-q"]
-    assert app.main([str(argument) for argument in arguments]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
+    options = ["--out", tmp_path, "--format", "json", "-q"]
+    code, out, err = run("study", "hierarchies", tmp_path / "ball.ply", *options)
+    assert (code, err) == (0, "")
     assert len(json.loads(out)["tables"]) == 1
     assert (tmp_path / "ball-hierarchies.png").stat().st_size > 1000
     assert (tmp_path / "ball-hierarchies.csv").read_text().startswith("hierarchy,")

@@ -10,8 +10,8 @@ from strategies import sphere
 import striptools
 from striptools.hierarchies.loose_octree import build_loose_octree
 from striptools.hierarchies.options import HierarchyOptions
-from striptools.measure.study import StudyOptions, study_rays
-from striptools.measure.study_loose import BUILDS, KINDS, study, tables
+from striptools.measure.study import RAY_KINDS, StudyOptions, study_rays
+from striptools.measure.study_loose import BUILDS, study, tables
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.partition.sah import half_area
@@ -77,7 +77,7 @@ def test_rows_tell_what_the_hierarchies_are_and_what_walks_count(found):
 
 def test_tables_have_a_line_a_row(found):
     parts = tables(found)
-    assert len(parts) == 1 + len(KINDS)
+    assert len(parts) == 1 + len(RAY_KINDS)
     assert all(len(rows) == len(found.rows) for _, rows in parts)
     assert parts[1][1][2]["ratio"] == 1
     assert parts[0][1][0]["B/triangle"] == found.rows[0].node_bytes / 2048

@@ -9,8 +9,8 @@ from strategies import sphere
 import striptools
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.hierarchies.slbvh import build_slbvh
-from striptools.measure.study import StudyOptions, study_rays
-from striptools.measure.study_slbvh import KINDS, study, tables
+from striptools.measure.study import RAY_KINDS, StudyOptions, study_rays
+from striptools.measure.study_slbvh import study, tables
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import Options
@@ -30,7 +30,7 @@ def test_there_is_a_row_for_each_balance_and_kind_of_objects(found):
     assert found.triangles == 2048
     assert found.ray_counts[0] == 24 * 24
     assert found.ray_counts[2] == 24 * 24 // 4
-    assert all(len(row.rays) == len(KINDS) for row in found.rows)
+    assert all(len(row.rays) == len(RAY_KINDS) for row in found.rows)
     assert all(cost.rate > 0 for row in found.rows for cost in row.rays)
 
 
@@ -50,7 +50,7 @@ def test_rows_tell_what_the_heaps_are_and_what_walks_count(found):
 
 def test_tables_have_a_line_a_row(found):
     parts = tables(found)
-    assert len(parts) == 1 + len(KINDS)
+    assert len(parts) == 1 + len(RAY_KINDS)
     assert all(len(rows) == len(found.rows) for _, rows in parts)
     assert parts[0][1][0] | {"build_s": None} == parts[0][1][0], "the wide walk has no build of its own"
     assert parts[1][1][0]["ratio"] == 1

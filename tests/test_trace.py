@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rays import aimed_rays
+from rays import aimed_rays, axial_rays, edge_targets, rays_at
 from scenes import scene_of, scenes, small_scene, with_positions
-from strategies import book, cube, fan, grid, soup, sphere, stack
+from shapes import COMMON
+from strategies import cube, sphere
 
 from striptools.errors import StriptoolsError, UsageError
 from striptools.kernels.rays import ROW, ready_rays
@@ -156,7 +157,7 @@ def assert_same_hits(scene, hits, expected, doubted=False):
 @given(scenes(), st.integers(0, 2**32 - 1))
 def test_equals_trying_every_triangle(drawn, seed):
     _, scene = drawn
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 60, seed)
+    origins, directions = rays_at(scene, 60, seed)
     tracer = Tracer(scene, device="cpu", threads=1)
     hits = tracer.closest_hit(origins, directions)
     expected = try_every_triangle(scene, origins, directions)
@@ -171,14 +172,11 @@ def ball():
     return scene_of(Mesh(positions, faces))
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [grid(20, 20), fan(300), book(26), soup(600, 1, 1000), soup(300, 2, 3), stack(40), cube(), sphere(3)],
-)
+@pytest.mark.parametrize("shape", COMMON.values(), ids=COMMON)
 @pytest.mark.parametrize("remap", [True, False])
 def test_shapes_equal_trying_every_triangle(shape, remap):
     scene = scene_of(Mesh(*clean(shape)), remap=remap, spare_faces=3)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 300, 5)
+    origins, directions = rays_at(scene, 300, 5)
     hits = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
     assert_same_hits(scene, hits, try_every_triangle(scene, origins, directions))
     assert hits.hit.sum() > 50
@@ -251,8 +249,7 @@ def test_no_ray_leaves_a_closed_sphere(scale, move):
     centre = np.array([move, -move, move]) * diagonal * scale
     positions = (points.astype(np.float64) * scale + centre).astype(np.float32)
     tracer = Tracer(scene_of(Mesh(positions, faces)), device="cpu")
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)
-    targets = np.concatenate([positions[edges].astype(np.float64).mean(axis=1), positions])
+    targets = edge_targets(positions, faces)
     random = np.random.default_rng(0)
     for _ in range(3):
         origin = (centre + random.normal(size=3) * 0.2 * scale).astype(np.float32)
@@ -268,11 +265,7 @@ def test_no_ray_leaves_a_closed_sphere(scale, move):
 def test_rays_along_axes_in_the_planes_of_boxes_hit(axis, sign):
     positions, faces = clean(cube())
     scene = scene_of(Mesh(positions, faces))
-    others = [k for k in range(3) if k != axis]
-    lattice = np.array([[i, j] for i in (0, 0.25, 0.5, 1) for j in (0, 0.25, 0.5, 1)], np.float32)
-    origins = np.full((len(lattice), 3), -5.0 * sign, np.float32)
-    origins[:, others] = lattice
-    inside = ((lattice > 0) & (lattice < 1)).all(axis=1)
+    origins, _, inside = axial_rays(axis, sign)
     tracer = Tracer(scene, device="cpu", threads=1)
     for zero in (0.0, -0.0, 1e-30, -1e-30):
         directions = np.full_like(origins, zero)
@@ -304,7 +297,7 @@ def test_order_of_faces_and_remap_change_nothing_but_names(ball):
 
 
 def test_all_threads_give_what_one_gives(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 5001, 4)
+    origins, directions = rays_at(ball, 5001, 4)
     one = Tracer(ball, device="cpu", threads=1)
     all_cores = Tracer(ball, device="cpu")
     assert len(one.devices) == 1
@@ -314,7 +307,7 @@ def test_all_threads_give_what_one_gives(ball):
 
 
 def test_walking_all_rays_at_once_gives_the_same(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 200, 6)
+    origins, directions = rays_at(ball, 200, 6)
     expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
     options = WalkOptions(1, any_hit=False, counting=True, stack_size=16, batch=True)
     reach = np.full(len(origins), np.inf, np.float32)
@@ -342,14 +335,14 @@ def assert_rebuilt_gives_the_same(scene, origins, directions):
 @given(scenes(), st.integers(0, 2**32 - 1))
 def test_a_rebuilt_hierarchy_changes_nothing(drawn, seed):
     _, scene = drawn
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 64, seed)
+    origins, directions = rays_at(scene, 64, seed)
     assert_rebuilt_gives_the_same(scene, origins, directions)
 
 
 @pytest.mark.parametrize("remap", [True, False])
 def test_a_rebuilt_hierarchy_changes_nothing_of_a_ball(remap):
     scene = scene_of(Mesh(*sphere(4)), remap=remap)
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 3000, 11)
+    origins, directions = rays_at(scene, 3000, 11)
     assert not assert_rebuilt_gives_the_same(scene, origins, directions).any()
 
 
@@ -364,7 +357,7 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
     scene = with_positions(ball, (ball.positions * np.float32(unit)).astype(np.float32))
     layout = lay(scene)
     arrays = layout.arrays
-    origins, directions = aimed_rays(scene.positions, scene.faces(), 2000, 12)
+    origins, directions = rays_at(scene, 2000, 12)
     random = np.random.default_rng(13)
     odd = np.array([0, -0.0, 1e-45, -1e-39, 1e-20, -1e-25, 1, -3, 1e30, 3e38, np.inf, -np.inf, np.nan], "f4")
     origins[:400] = np.where(random.random((400, 3)) < 0.3, random.choice(odd, (400, 3)), origins[:400])
@@ -388,7 +381,7 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
 
 
 def test_power_of_two_units_change_nothing(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 500, 8)
+    origins, directions = rays_at(ball, 500, 8)
     expected = Tracer(ball, device="cpu", threads=1).closest_hit(origins, directions)
     for unit in (np.float32(2.0**-40), np.float32(2.0**40)):
         scene = with_positions(ball, ball.positions * unit)
@@ -402,7 +395,7 @@ def test_power_of_two_units_change_nothing(ball):
 
 
 def test_steps_are_counted_only_when_asked(ball):
-    origins, directions = aimed_rays(ball.positions, ball.faces(), 100, 9)
+    origins, directions = rays_at(ball, 100, 9)
     tracer = Tracer(ball, device="cpu", threads=1)
     plain, counted = (
         tracer.closest_hit(origins, directions),
@@ -509,14 +502,20 @@ def test_doubles_and_lists_are_taken(ball):
     assert hits.t[0] == pytest.approx(1.0)
 
 
-def test_a_tree_that_goes_round_ends_and_is_told():
+def going_round():
+    """The tracer of a tree whose nodes have the root for a child."""
     tracer = Tracer(small_scene(), device="cpu", threads=1)
     layout = tracer._layout
     nodes = layout.arrays.nodes.copy()
     children = nodes[0, 6].view(np.int32)
     children[children != DONE] = 0
     tracer._take(replace(layout, arrays=layout.arrays._replace(nodes=nodes)))
-    origins, directions = aimed_rays(small_scene().positions, small_scene().faces(), 50, 0)
+    return tracer
+
+
+def test_a_tree_that_goes_round_ends_and_is_told():
+    tracer = going_round()
+    origins, directions = rays_at(small_scene(), 50, 0)
     with pytest.raises(StriptoolsError, match="did not end"):
         tracer.closest_hit(origins, directions)
     with pytest.raises(StriptoolsError, match="did not end"):

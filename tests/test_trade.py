@@ -11,7 +11,7 @@ import pytest
 from striptools.measure import trade as module
 from striptools.measure.plots_trade import pareto, plot_trade
 from striptools.measure.report_html import pictures_of, report_html, sentences
-from striptools.measure.trade import STATE, Trade, TradeOptions, peer_distance, trade, trade_from_dict
+from striptools.measure.trade import STATE, Point, Trade, TradeOptions, peer_distance, trade
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
 from striptools.measure.trade_points import BASELINE, Setting, settings
 from striptools.mesh.clean import clean
@@ -126,7 +126,9 @@ def test_an_interrupted_trade_goes_on(
 
 
 def test_json_and_back(done: tuple[Trade, Path]) -> None:
-    assert trade_from_dict(json.loads(json.dumps(done[0].to_dict()))) == done[0]
+    facts = json.loads(json.dumps(done[0].to_dict()))
+    points, rays = tuple(Point(**row) for row in facts["points"]), tuple(facts["rays"])
+    assert Trade(**{**facts, "points": points, "rays": rays}) == done[0]
 
 
 def test_a_report_stands_alone(done: tuple[Trade, Path]) -> None:

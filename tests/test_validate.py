@@ -6,6 +6,7 @@ import json
 import struct
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ import pytest
 from formats import VECTORS, cases, make
 from striptools.reducem.issues import ISSUES
 from striptools.reducem.validate import validate
-from striptools_cli import app
 
 GOOD = VECTORS / "valid" / "boxes_two_blocks.rdm"
 BAD = VECTORS / "invalid" / "index_too_large.rdm"
@@ -125,13 +125,8 @@ def test_a_real_model_is_valid_and_judged_in_seconds(real_mesh, tmp_path):
 
 
 @pytest.fixture
-def run(capsys):
-    def call(*arguments):
-        code = app.main(["validate", *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
+def run(run):
+    return partial(run, "validate")
 
 
 def test_a_valid_file_is_said_to_be_so(run):

@@ -18,7 +18,6 @@ from striptools.hierarchies.wide import (
     WIDTH,
     check_wide_tree,
     collapse,
-    wide_cost,
 )
 from striptools.partition.boxes import face_boxes, node_boxes
 from striptools.partition.object_split import split_objects
@@ -72,6 +71,18 @@ def test_collapsed_tree_is_whole(mesh, leaf_size):
     check_wide_tree(wide, boxes)
     assert wide.leaf_count.max() <= leaf_size
     assert 1 <= wide.depth <= len(wide.boxes)
+
+
+def wide_cost(tree):
+    """The expected cost of a ray that meets the root's box, in visits to a wide node."""
+    used = tree.child != EMPTY
+    boxes = np.moveaxis(tree.boxes, 1, 2)
+    area = half_area(boxes.reshape(-1, 6)).reshape(used.shape)
+    cost = np.where(tree.child >= 0, WIDE_NODE_COST, LEAF_BLOCK_COST)
+    lanes = boxes[0][used[0]]
+    root = half_area(np.concatenate([lanes[:, :3].min(axis=0), lanes[:, 3:].max(axis=0)])[None])[0]
+    share = area / root if root > 0 else np.ones_like(area)
+    return float(WIDE_NODE_COST + (share * cost)[used].sum())
 
 
 @pytest.mark.parametrize("leaf_size", [1, 2, 8])

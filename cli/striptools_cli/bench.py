@@ -24,6 +24,7 @@ from striptools.measure.bench import (
 from striptools.measure.bench_scripts import Script, part_of, run_script, scripts
 from striptools.mesh.io import load_mesh
 from striptools_cli import log, notice
+from striptools_cli.options import format_option, quiet_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import say
@@ -64,8 +65,8 @@ def run(
             show_default=False,
         ),
     ] = None,
-    form: Annotated[Format, typer.Option("--format", help="How to print the figures.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and figures.")] = False,
+    form: Annotated[Format, format_option("the figures")] = "text",
+    quiet: Annotated[bool, quiet_option("errors and figures")] = False,
 ) -> None:
     """Measure every figure beside the installed peers, and say what got worse on this machine.
 

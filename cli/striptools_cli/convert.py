@@ -40,6 +40,7 @@ from striptools.strips.ordering import (
 )
 from striptools_cli import log, notice
 from striptools_cli.hierarchy import asked_for
+from striptools_cli.options import Threads, from_option, quiet_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes, human_value, render
 from striptools_cli.streams import (
@@ -256,13 +257,8 @@ def run(
             "--strips", help="Write classic strips: GLB of triangle strips, else faces in their order."
         ),
     ] = False,
-    threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
-    ] = None,
-    from_format: Annotated[
-        str | None,
-        typer.Option("--from", metavar="FORMAT", help="Format of IN.", show_default="extension"),
-    ] = None,
+    threads: Threads = None,
+    from_format: Annotated[str | None, from_option("IN")] = None,
     to_format: Annotated[
         str | None,
         typer.Option("--to", metavar="FORMAT", help="Format of OUT.", show_default="extension"),
@@ -274,7 +270,7 @@ def run(
             help="Store a mesh that a glTF scene has in several places once, or flatten the scene.",
         ),
     ] = _OPTIONS.instances,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    quiet: Annotated[bool, quiet_option()] = False,
     verbose: Annotated[
         bool, typer.Option("-v", "--verbose", help="Add seconds by stage, bytes by part.")
     ] = False,

@@ -6,12 +6,11 @@ import platform
 import sys
 from typing import Annotated
 
-import typer
-
 from striptools import __version__
 from striptools.errors import StriptoolsError
 from striptools.reducem.layout import VERSION
 from striptools_cli import log, notice
+from striptools_cli.options import format_option
 from striptools_cli.report import Format, render
 from striptools_cli.streams import say
 
@@ -27,7 +26,7 @@ _EXTRAS = {
 
 
 def run(
-    form: Annotated[Format, typer.Option("--format", help="How to print it.")] = "text",
+    form: Annotated[Format, format_option("it")] = "text",
 ) -> None:
     """Print the environment, for bug reports: versions, cores, devices, caches, extras."""
     log.set_up()

@@ -9,6 +9,7 @@ from striptools.errors import EXIT_DONE, EXIT_ISSUES, UsageError
 from striptools.measure.extreme_rows import ROWS, Row
 from striptools.measure.extremes import MODES, ExtremesReport, RowResult, rows_of, run_extremes
 from striptools_cli import log, notice
+from striptools_cli.options import format_option, quiet_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render_table
 from striptools_cli.streams import say
@@ -24,8 +25,8 @@ def run(
     only: Annotated[
         list[str] | None, typer.Option(metavar="WORD", help="Only rows with this in their name; repeatable.")
     ] = None,
-    form: Annotated[Format, typer.Option("--format", help="How to print the table.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    form: Annotated[Format, format_option("the table")] = "text",
+    quiet: Annotated[bool, quiet_option()] = False,
 ) -> None:
     """Run every extreme case through every mode of tracing, and say whether each did what was expected.
 

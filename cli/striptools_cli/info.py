@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from striptools.reducem.check_hierarchy import hierarchy_depth
 from striptools.reducem.layout import VERSION
@@ -11,13 +10,14 @@ from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene
 from striptools.reducem.stored_hierarchy import name_of, over_of
 from striptools_cli import log
+from striptools_cli.options import SceneFile, format_option
 from striptools_cli.report import Format, render
 from striptools_cli.streams import Source, say
 
 
 def run(
-    source: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
-    form: Annotated[Format, typer.Option("--format", help="How to print it.")] = "text",
+    source: SceneFile,
+    form: Annotated[Format, format_option("it")] = "text",
 ) -> None:
     """Say what is in a scene file, and how many bytes each part takes.
 

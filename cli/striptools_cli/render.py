@@ -4,7 +4,7 @@ import inspect
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -14,11 +14,12 @@ from striptools.mesh.atomic import refusals_named
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
-from striptools.trace.device import DeviceKind
 from striptools.trace.rays import Camera, turntable
 from striptools.trace.render import MOST_AO, RenderOptions, Shading, render, save_gif, save_png
 from striptools.trace.surface import Surface
 from striptools_cli import log, notice
+from striptools_cli.options import SceneFile, quiet_option
+from striptools_cli.options_trace import Device, TraceThreads, Up
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import human_bytes
 from striptools_cli.streams import STANDARD, Source, Target, refuse_same, say
@@ -33,11 +34,9 @@ ROUND_SECONDS = 4.0
 SHOW_SECONDS = 1.0
 """Between two states of a picture on its way."""
 
-Up = Literal["x", "y", "z", "-x", "-y", "-z"]
-
 
 def run(
-    scene: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
+    scene: SceneFile,
     target: Annotated[
         str | None, typer.Argument(metavar="[OUT.png]", help="Picture; - for standard output.")
     ] = None,
@@ -66,7 +65,7 @@ def run(
     view: Annotated[
         str, typer.Option(metavar="R,U,F", help="Where the eye is: right, up and front parts.")
     ] = _VIEW,
-    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = _FRAMING["up"],
+    up: Up = _FRAMING["up"],
     frames: Annotated[
         int | None,
         typer.Option(
@@ -83,13 +82,9 @@ def run(
         bool, typer.Option("--progressive", help="Write OUT.png every second while it is drawn.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace pictures that exist.")] = False,
-    device: Annotated[
-        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
-    ] = "auto",
-    threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads to trace with.", show_default="every core")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    device: Device = "auto",
+    threads: TraceThreads = None,
+    quiet: Annotated[bool, quiet_option()] = False,
 ) -> None:
     """Draw a picture of a scene file, with the whole model in view, or of a model that turns.
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from striptools.measure.plots import plot_study, require_plots
+from striptools.measure.plots import plot_study, require_plots, titled
 from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range, study_strips
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
@@ -16,14 +16,14 @@ from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options
 from striptools.stopwatch import Watch
 from striptools.strips.ordering import OrderingOptions
-from striptools.trace.device import DeviceKind
 from striptools_cli import log, notice
+from striptools_cli.options import Threads, format_option, from_option, quiet_option
+from striptools_cli.options_trace import Device, Up, runs_option, side_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import STANDARD, Source, folder_for, input_format, say
 
 Subject = Literal["strips", "presorted", "slbvh", "kdtree", "loose-octree", "hierarchies"]
-Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 _DEFAULTS = StudyOptions()
 _ORDER = OrderingOptions()
@@ -42,33 +42,17 @@ def run(
         ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs: a first impression.")] = False,
-    side: Annotated[
-        int | None,
-        typer.Option(
-            min=8, max=8192, metavar="N", help="N x N primary rays.", show_default=str(_DEFAULTS.side)
-        ),
-    ] = None,
-    runs: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="N", help="Runs to take the median of.", show_default=str(_DEFAULTS.runs)
-        ),
-    ] = None,
+    side: Annotated[int | None, side_option(8192, _DEFAULTS.side)] = None,
+    runs: Annotated[int | None, runs_option(_DEFAULTS.runs)] = None,
     max_length: Annotated[
         int, typer.Option(min=1, metavar="N", help="Most triangles in a strip of Strip-RT.")
     ] = _ORDER.max_length,
-    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = "y",
-    device: Annotated[
-        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
-    ] = "auto",
-    threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
-    ] = None,
-    from_format: Annotated[
-        str | None, typer.Option("--from", metavar="FORMAT", help="Format of MESH.", show_default="extension")
-    ] = None,
-    form: Annotated[Format, typer.Option("--format", help="How to print the tables.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and tables.")] = False,
+    up: Up = "y",
+    device: Device = "auto",
+    threads: Threads = None,
+    from_format: Annotated[str | None, from_option("MESH")] = None,
+    form: Annotated[Format, format_option("the tables")] = "text",
+    quiet: Annotated[bool, quiet_option("errors and tables")] = False,
 ) -> None:
     """Compare what methods make of a mesh, all else being equal, and what their papers say.
 
@@ -142,8 +126,7 @@ def printed_tables(tables: Tables, form: Format, title: str) -> str:
     """Tables as text, json, csv or md, one after another; those of csv have an empty line between them."""
     if form == "json":
         return render({"tables": [{"title": name, "rows": rows} for name, rows in tables]}, "json")
-    heading = f"{title}: " if title else ""
-    parts = [render_table(rows, form, heading + name) for name, rows in tables if rows]
+    parts = [render_table(rows, form, titled(title, name)) for name, rows in tables if rows]
     return "\n".join(parts)
 
 

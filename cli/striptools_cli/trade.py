@@ -12,12 +12,12 @@ from striptools.measure.trade import Point, Trade, TradeOptions, trade
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
 from striptools.pipeline import Options
-from striptools.trace.device import DeviceKind
 from striptools_cli import log, notice
+from striptools_cli.options import Threads, format_option, from_option, quiet_option
+from striptools_cli.options_trace import Device, Up, runs_option, side_option
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import STANDARD, Source, folder_for, input_format, say
-from striptools_cli.study import Up
 
 _DEFAULTS = TradeOptions()
 _QUICK = {"side": 256, "runs": 5, "picture": 128, "verify_rays": 16, "aimed_rays": 2048}
@@ -42,30 +42,14 @@ def run(
         ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few points and rays: a first impression.")] = False,
-    side: Annotated[
-        int | None,
-        typer.Option(
-            min=8, max=4096, metavar="N", help="N x N primary rays.", show_default=str(_DEFAULTS.side)
-        ),
-    ] = None,
-    runs: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="N", help="Runs to take the median of.", show_default=str(_DEFAULTS.runs)
-        ),
-    ] = None,
-    up: Annotated[Up, typer.Option(help="The model's axis that points up.")] = "y",
-    device: Annotated[
-        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
-    ] = "auto",
-    threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads to use.", show_default="every core")
-    ] = None,
-    from_format: Annotated[
-        str | None, typer.Option("--from", metavar="FORMAT", help="Format of MESH.", show_default="extension")
-    ] = None,
-    form: Annotated[Format, typer.Option("--format", help="How to print the points.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors and tables.")] = False,
+    side: Annotated[int | None, side_option(4096, _DEFAULTS.side)] = None,
+    runs: Annotated[int | None, runs_option(_DEFAULTS.runs)] = None,
+    up: Up = "y",
+    device: Device = "auto",
+    threads: Threads = None,
+    from_format: Annotated[str | None, from_option("MESH")] = None,
+    form: Annotated[Format, format_option("the points")] = "text",
+    quiet: Annotated[bool, quiet_option("errors and tables")] = False,
 ) -> None:
     """Measure what bytes, speed and error are traded for each other, one factor at a time.
 

@@ -8,6 +8,7 @@ from striptools.errors import EXIT_DONE, EXIT_ISSUES
 from striptools.reducem.issues import Finding, unreadable
 from striptools.reducem.validate import validate
 from striptools_cli import log
+from striptools_cli.options import SceneFile, format_option
 from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import Source, say
 
@@ -16,8 +17,8 @@ _NAMES = ("severity", "code", "clause", "offset", "place", "message", "remedy")
 
 
 def run(
-    source: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
-    form: Annotated[Format, typer.Option("--format", help="How to print the findings.")] = "text",
+    source: SceneFile,
+    form: Annotated[Format, format_option("the findings")] = "text",
 ) -> None:
     """Name every rule of the format that a scene file breaks, and the byte where it does.
 

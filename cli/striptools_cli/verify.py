@@ -11,8 +11,9 @@ from striptools.measure.verify import VerifyOptions, VerifyReport, verify
 from striptools.mesh.io import load_mesh
 from striptools.reducem.reader import read_scene
 from striptools.trace import Tracer
-from striptools.trace.device import DeviceKind
 from striptools_cli import log, notice
+from striptools_cli.options import SceneFile, format_option, from_option, quiet_option
+from striptools_cli.options_trace import Device, TraceThreads
 from striptools_cli.progress import StageProgress
 from striptools_cli.report import Format, human_value, render
 from striptools_cli.streams import Source, input_format, say
@@ -21,7 +22,7 @@ _DEFAULTS = VerifyOptions()
 
 
 def run(
-    scene: Annotated[str, typer.Argument(metavar="FILE.rdm", help="Scene file; - for standard input.")],
+    scene: SceneFile,
     against: Annotated[
         str, typer.Option(metavar="MESH", help="The mesh it was made from; - for standard input.")
     ],
@@ -36,17 +37,11 @@ def run(
         typer.Option(min=1, metavar="N", help="Most pairs of a ray and a face; caps --rays on large models."),
     ] = _DEFAULTS.pair_budget,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the random rays.")] = _DEFAULTS.seed,
-    device: Annotated[
-        DeviceKind, typer.Option(help="Where to trace; auto takes a GPU if there is one.")
-    ] = "auto",
-    threads: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads to trace with.", show_default="every core")
-    ] = None,
-    from_format: Annotated[
-        str | None, typer.Option("--from", metavar="FORMAT", help="Format of MESH.", show_default="extension")
-    ] = None,
-    form: Annotated[Format, typer.Option("--format", help="How to print the report.")] = "text",
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    device: Device = "auto",
+    threads: TraceThreads = None,
+    from_format: Annotated[str | None, from_option("MESH")] = None,
+    form: Annotated[Format, format_option("the report")] = "text",
+    quiet: Annotated[bool, quiet_option()] = False,
 ) -> None:
     """Trace a scene file with JAX and prove it against the mesh it was made from.
 

@@ -56,9 +56,6 @@ Runs = UInt32[np.ndarray, " r"]
 LONGEST_RUN = 8
 """The most triangles of a run: the lanes of a leaf test."""
 
-MOST_CELLS = 65536
-"""A scene is below this many cells long on each axis, so that an origin fits 16 bits."""
-
 LEAST_CELL, LARGEST_CELL = -149, 127
 
 RUN_PRICE = 0.05
@@ -128,7 +125,7 @@ class Roots:
 
 
 def box_grid(low: np.ndarray, high: np.ndarray) -> BoxGrid:
-    """The finest grid on which the scene is below `MOST_CELLS` cells long on each axis.
+    """The finest grid on which the scene is below 2^16 cells long on each axis: an origin fits 16 bits.
 
     Args:
         low: (3,) float32, the least coordinates; finite.

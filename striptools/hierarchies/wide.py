@@ -24,7 +24,6 @@ from jaxtyping import Float32, Int32
 from striptools.errors import UnreadableSceneError
 from striptools.hierarchies.in_strip import BinaryTree
 from striptools.kernels.wide import EMPTY, WIDTH, cheapest_forests, emit_wide
-from striptools.partition.sah import half_area
 from striptools.types import Boxes, Counts
 
 WideBoxes = Float32[np.ndarray, "w 6 8"]
@@ -75,18 +74,6 @@ def collapse(tree: BinaryTree, leaf_size: int = WIDTH) -> WideTree:
     )
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))
-
-
-def wide_cost(tree: WideTree) -> float:
-    """The expected cost of a ray that meets the root's box, in visits to a wide node."""
-    used = tree.child != EMPTY
-    boxes = np.moveaxis(tree.boxes, 1, 2)
-    area = half_area(boxes.reshape(-1, 6)).reshape(used.shape)
-    cost = np.where(tree.child >= 0, WIDE_NODE_COST, LEAF_BLOCK_COST)
-    lanes = boxes[0][used[0]]
-    root = half_area(np.concatenate([lanes[:, :3].min(axis=0), lanes[:, 3:].max(axis=0)])[None])[0]
-    share = area / root if root > 0 else np.ones_like(area)
-    return float(WIDE_NODE_COST + (share * cost)[used].sum())
 
 
 def check_wide_tree(tree: WideTree, triangle_boxes: Boxes) -> None:
@@ -153,4 +140,4 @@ def _require(holds: bool, flaw: str) -> None:
         raise UnreadableSceneError(flaw, where="wide hierarchy", remedy="convert the model again")
 
 
-__all__ = ["EMPTY", "WIDTH", "WideTree", "check_wide_tree", "collapse", "wide_cost"]
+__all__ = ["EMPTY", "WIDTH", "WideTree", "check_wide_tree", "collapse"]

@@ -5,6 +5,7 @@ behind. The same figures give the same bytes with the same matplotlib.
 """
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import IO, TYPE_CHECKING
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 INK = {"strip-rt": "#1b6ca8", "paper": "#7fb2d6", "stripe": "#c8553d", "tipsify": "#e0a030"}
 """A colour for each method."""
 
-_LIGHT = "#b9bdc4"
+LIGHT = "#b9bdc4"
+"""A colour for what stands behind."""
 
 
 def require_plots() -> ModuleType:
@@ -59,8 +61,8 @@ def plot_study(study: Study, target: str | Path | IO[bytes], title: str = "") ->
     _plot_rate(rate, study)
     _plot_lead(lead, study)
     _plot_lengths(lengths, study)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}{study.triangles:,} triangles, stripifiers under the same representation")
+    what = f"{study.triangles:,} triangles, stripifiers under the same representation"
+    figure.suptitle(titled(title, what))
     return save_figure(figure, target)
 
 
@@ -70,17 +72,43 @@ def save_figure(figure: "Figure", target: str | Path | IO[bytes]) -> int:
     Raises:
         WriteError: The file could not be written.
     """
+    data = png_of(figure)
+    return write_atomically(target, data) if isinstance(target, str | Path) else write_stream(target, data)
+
+
+def png_of(figure: "Figure") -> bytes:
+    """A figure as a PNG picture, of the same bytes each time."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
-    data = buffer.getvalue()
-    return write_atomically(target, data) if isinstance(target, str | Path) else write_stream(target, data)
+    return buffer.getvalue()
+
+
+def titled(title: str, what: str) -> str:
+    """What something says under a model's name, which may be empty."""
+    return f"{title}: {what}" if title else what
+
+
+def name_rows(axes: "Axes", names: list[str]) -> None:
+    """Name bars that lie from the top down at 0, 1, ..."""
+    axes.set_yticks(np.arange(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+
+
+def legend_below(
+    axes: "Axes", *, columns: int, drop: float = 0.06, labels: Sequence[str] | None = None
+) -> None:
+    """Put a legend under a plot, of its labels or of those given, so far down in parts of its height."""
+    given = () if labels is None else (labels,)
+    axes.legend(
+        *given, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -drop), ncols=columns, frameon=False
+    )
 
 
 def _plot_memory(axes: "Axes", study: Study) -> None:
     rows = study.rows
     swaps = [row.swap_bytes / study.triangles for row in rows]
     here = [row.scene_bytes / study.triangles for row in rows]
-    _bars(axes, rows, swaps, _LIGHT)
+    _bars(axes, rows, swaps, LIGHT)
     _bars(axes, rows, here, [INK[row.method] for row in rows])
     for place, (low, high) in enumerate(zip(here, swaps, strict=True)):
         axes.annotate(f" {low:.1f} / {high:.1f}", (max(low, high), place), va="center", fontsize=8)
@@ -100,9 +128,9 @@ def _plot_rate(axes: "Axes", study: Study) -> None:
         for y, value in zip(place + shift, values, strict=True):
             axes.annotate(f" {value:.2f}", (value, y), va="center", fontsize=8)
         axes.barh([0], [0], color="#555555", alpha=alpha, label=label)
-    _name_rows(axes, rows)
+    name_rows(axes, [row.variant for row in rows])
     axes.set_title("traced rays, millions a second (fastest run)", fontsize=10)
-    _legend_below(axes)
+    legend_below(axes, columns=4)
     axes.margins(x=0.12)
 
 
@@ -120,9 +148,9 @@ def _plot_lead(axes: "Axes", study: Study) -> None:
         label="secondary", zorder=3,
     )  # fmt: skip
     axes.axvline(1.0, color="#222222", linewidth=0.8)
-    _name_rows(axes, rows)
+    name_rows(axes, [row.variant for row in rows])
     axes.set_title("rays a second of strip-rt over those of ...", fontsize=10)
-    _legend_below(axes)
+    legend_below(axes, columns=4)
 
 
 def _plot_lengths(axes: "Axes", study: Study) -> None:
@@ -137,11 +165,7 @@ def _plot_lengths(axes: "Axes", study: Study) -> None:
     axes.set_yscale("symlog", linthresh=1)
     axes.set_ylim(0, 2 * max(max(row.quality.lengths.values()) for row in chosen))
     axes.set_title("strips by length in triangles (bins k to 2k - 1)", fontsize=10)
-    _legend_below(axes)
-
-
-def _legend_below(axes: "Axes") -> None:
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=4, frameon=False)
+    legend_below(axes, columns=4)
 
 
 def _labels(axes: "Axes") -> str:
@@ -150,9 +174,4 @@ def _labels(axes: "Axes") -> str:
 
 def _bars(axes: "Axes", rows: tuple[StudyRow, ...], values: list[float], colour: object) -> None:
     axes.barh(np.arange(len(rows)), values, 0.7, color=colour)  # pyright: ignore[reportArgumentType]
-    _name_rows(axes, rows)
-
-
-def _name_rows(axes: "Axes", rows: tuple[StudyRow, ...] | list[StudyRow]) -> None:
-    axes.set_yticks(np.arange(len(rows)), [row.variant for row in rows])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    name_rows(axes, [row.variant for row in rows])

@@ -1,11 +1,10 @@
 """Pareto plots of a trade: what bytes cost in error and in speed, and which points nothing beats."""
 
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from striptools.measure.plots import require_plots
+from striptools.measure.plots import LIGHT, png_of, require_plots
 from striptools.measure.trade import Point, Trade
 from striptools.measure.trade_points import BASELINE
 
@@ -55,9 +54,7 @@ def plot_trade(trade: Trade) -> bytes:
     figure.suptitle(
         f"{trade.model}: {trade.triangles:,} triangles; lines join what nothing beats", fontsize=11
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+    return png_of(figure)
 
 
 def _panel(axes: "Axes", trade: Trade, bytes_name: str, label: str) -> None:
@@ -77,7 +74,7 @@ def _speed_panel(axes: "Axes", trade: Trade) -> None:
     _scatter(axes, trade.points, points)
     places = np.array(points)
     _front(axes, places, places * [1, -1])
-    axes.axhline(1.0, color="#b9bdc4", linewidth=0.8, zorder=0)
+    axes.axhline(1.0, color=LIGHT, linewidth=0.8, zorder=0)
     axes.set_xscale("log")
     axes.set_xlabel("as traced, bytes per source triangle", fontsize=9)
     axes.set_ylabel("secondary rays a second, default = 1", fontsize=9)

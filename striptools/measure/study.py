@@ -21,6 +21,7 @@ same program. Differences:
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -32,7 +33,9 @@ from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions
 from striptools.trace import Tracer
+from striptools.trace.counters import Counters
 from striptools.trace.device import DeviceKind
+from striptools.trace.layout import Layout
 from striptools.trace.rays import UP_CHOICES, Camera, camera_rays, cosine_rays
 from striptools.types import RayVectors
 
@@ -50,6 +53,9 @@ SLICE = 2**17
 
 LIFT = 1e-5
 """How far off the surface secondary rays start, in parts of the model's diagonal."""
+
+RAY_KINDS = ("camera", "AO", "random")
+"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +181,32 @@ class RaySet:
     directions: RayVectors
 
 
+Row = TypeVar("Row")
+
+
+@dataclass(frozen=True)
+class KindsStudy(Generic[Row]):
+    """What a study with rays of each kind found.
+
+    Attributes:
+        triangles: Triangles of the scene.
+        ray_counts: Rays in a run, by `RAY_KINDS`.
+        devices: What it was traced on.
+        rows: A row a hierarchy.
+    """
+
+    triangles: int
+    ray_counts: tuple[int, ...]
+    devices: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, tracer: Tracer, rays: tuple[RaySet, ...], rows: list[Row]) -> "KindsStudy[Row]":
+        """The study of a scene, traced with these rays on the devices of a tracer."""
+        devices = tuple(str(device) for device in tracer.devices)
+        return cls(scene.triangle_count, tuple(len(part.origins) for part in rays), devices, tuple(rows))
+
+
 def variants(ordering: OrderingOptions) -> dict[str, OrderingOptions]:
     """The orderings that are compared, by name: Strip-RT as asked for, as the paper has it, the baselines.
 
@@ -276,6 +308,38 @@ def study_rays(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[Ray
     return RaySet(origins, directions), RaySet(*cosine_rays(points, normals, offset=offset))
 
 
+def random_rays(scene: Scene, count: int) -> RaySet:
+    """Rays from anywhere in a scene's bounds in any direction, the same ones each time."""
+    random = np.random.default_rng(1)
+    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
+    origins = low + (high - low) * random.random((count, 3))
+    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
+
+
+def rays_of_each_kind(scene: Scene, tracer: Tracer, options: StudyOptions) -> tuple[RaySet, ...]:
+    """Rays by `RAY_KINDS`; a random one to four pixels."""
+    return (*study_rays(scene, tracer, options), random_rays(scene, options.side**2 // 4))
+
+
+def ray_counters(tracer: Tracer, rays: RaySet) -> Counters:
+    """What each ray visits, tests and reads."""
+    counters = tracer.closest_hit(rays.origins, rays.directions, counters=True).counters
+    assert counters is not None
+    return counters
+
+
+def mean_counters(tracer: Tracer, rays: RaySet) -> Counters:
+    """What a ray visits, tests and reads on the average, a float each; 0 where there is no ray."""
+    counters = ray_counters(tracer, rays)
+    return Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters))
+
+
+def wide_bytes(layout: Layout) -> int:
+    """Bytes of the wide nodes of a layout that are in use."""
+    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
+    return int(used.sum()) * layout.arrays.nodes[0].nbytes
+
+
 def _steps(
     tracers: dict[str, Tracer], rays: tuple[RaySet, RaySet], tell: Watch
 ) -> dict[str, tuple[float, float]]:
@@ -361,6 +425,23 @@ def rate_and_ratio(rays: int, seconds: np.ndarray, of_reference: np.ndarray) -> 
     if rays == 0:
         return 0.0, 1.0
     return rays / float(seconds.min()), float(np.median(seconds / of_reference))
+
+
+def rates_and_ratios(
+    rays: tuple[RaySet, ...], seconds: np.ndarray, of_reference: np.ndarray
+) -> list[tuple[float, float]]:
+    """Of each kind of rays: rays a second in the fastest run, and this rate over the reference's.
+
+    Args:
+        rays: Of k kinds.
+        seconds: (runs, k).
+        of_reference: The same of the reference.
+    """
+    found = []
+    for kind, part in enumerate(rays):
+        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_reference[:, kind])
+        found.append((rate, 1 / lead))
+    return found
 
 
 def tell_no_one(_stage: str, _fraction: float) -> None:

@@ -19,13 +19,16 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.loose_octree import LooseBvh
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.measure.hierarchy_cost import hierarchy_cost
-from striptools.measure.plots import require_plots, save_figure
+from striptools.measure.plots import LIGHT, legend_below, name_rows, require_plots, save_figure, titled
 from striptools.measure.quality import full_tree_cost, in_strip_tree
 from striptools.measure.study import (
+    RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
-    rate_and_ratio,
-    study_rays,
+    mean_counters,
+    rates_and_ratios,
+    rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
 )
@@ -45,10 +48,7 @@ from striptools.trace.tracer import ResidentKind
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["KINDS", "HierarchiesStudy", "HierarchyRow", "RayCost", "plot", "study", "tables"]
-
-KINDS = ("camera", "AO", "random")
-"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
+__all__ = ["HierarchiesStudy", "HierarchyRow", "RayCost", "plot", "study", "tables"]
 
 WIDE, OTHER = "reducem", "other"
 
@@ -93,7 +93,7 @@ class HierarchyRow:
         file_bytes: What a scene file of it takes, remap and attributes left out; None where none holds it.
         hierarchy_bytes: Those of the hierarchy among them, or what its nodes would take.
         cost: Expected cost of a ray, over that of a full SAH tree.
-        rays: What rays cost, by `KINDS`.
+        rays: What rays cost, by `RAY_KINDS`.
         judged: Rays that the oracle judged.
         disagreements: Those with a wrong answer.
         leaks: Those that slipped through.
@@ -112,21 +112,8 @@ class HierarchyRow:
     different: int
 
 
-@dataclass(frozen=True)
-class HierarchiesStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind.
-        devices: What it was traced on.
-        rows: The default hierarchy first.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[HierarchyRow, ...]
+HierarchiesStudy = KindsStudy[HierarchyRow]
+"""What the study found: a row of the default hierarchy first."""
 
 
 @dataclass(frozen=True)
@@ -158,15 +145,14 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     scene = convert(mesh, replace(options.options, instances=False, remap=True, boxes="rebuilt"))
     threads = options.threads or every_core()
     wide = Tracer(scene, device=options.device, threads=options.threads, resident="expanded")
-    rays = (*study_rays(scene, wide, options), _random_rays(scene, options.side**2 // 4))
+    rays = rays_of_each_kind(scene, wide, options)
     run = _Run(mesh, scene, rays, wide, options, tell, full_tree_cost(scene.triangle_boxes(threads)))
     candidates = _candidates(scene, threads)
     rows = []
     for done, candidate in enumerate(candidates):
         tell("build", done / len(candidates))
         rows.append(run.row(candidate))
-    devices = tuple(str(device) for device in wide.devices)
-    return HierarchiesStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
+    return HierarchiesStudy.of(scene, wide, rays, rows)
 
 
 def _candidates(scene: Scene, threads: int) -> list[_Candidate]:
@@ -211,13 +197,6 @@ def _nodes_of(tree: BinaryTree) -> np.ndarray:
     return nodes
 
 
-def _random_rays(scene: Scene, count: int) -> RaySet:
-    random = np.random.default_rng(1)
-    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
-    origins = low + (high - low) * random.random((count, 3))
-    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
-
-
 class _Run:
     """What all rows are measured by."""
 
@@ -243,14 +222,10 @@ class _Run:
         seconds = time.perf_counter() - start
         options = self.options
         tracer = Tracer(scene, device=options.device, threads=options.threads, resident=candidate.resident)
-        counted = [
-            tracer.closest_hit(part.origins, part.directions, counters=True).counters for part in self.rays
-        ]
+        counted = [mean_counters(tracer, part) for part in self.rays]
         times = timed_in_turn({WIDE: self.wide, OTHER: tracer}, self.rays, options.runs, self.tell)
-        costs = []
-        for kind, (part, counters) in enumerate(zip(self.rays, counted, strict=True)):
-            rate, lead = rate_and_ratio(len(part.origins), times[OTHER][:, kind], times[WIDE][:, kind])
-            costs.append(RayCost(rate, 1 / lead, _mean(counters, "boxes"), _mean(counters, "triangles")))
+        rates = rates_and_ratios(self.rays, times[OTHER], times[WIDE])
+        costs = [RayCost(*rate, k.boxes, k.triangles) for rate, k in zip(rates, counted, strict=True)]
         hits = [tracer.closest_hit(part.origins, part.directions) for part in self.rays]
         different = sum(_different(one, other) for one, other in zip(hits, self.hits, strict=True))
         report = verify(scene, self.mesh, JUDGED, tracer=tracer)
@@ -258,11 +233,6 @@ class _Run:
         cost = hierarchy_cost(scene) / self.full_cost
         judged = (report.rays, report.disagreements + report.structure.errors, report.leaks, different)
         return HierarchyRow(candidate.name, seconds, *sizes, cost, tuple(costs), *judged)
-
-
-def _mean(counters: object, name: str) -> float:
-    values = getattr(counters, name)
-    return float(values.mean(dtype=np.float64)) if len(values) else 0.0
 
 
 def _different(one: Hits, other: Hits) -> int:
@@ -285,7 +255,7 @@ def _sizes(scene: Scene, *, has_file: bool) -> tuple[int | None, int]:
 
 def tables(study: HierarchiesStudy) -> list[tuple[str, list[dict[str, object]]]]:
     """The study as one table."""
-    counts = ", ".join(f"{count:,} {kind}" for count, kind in zip(study.ray_counts, KINDS, strict=True))
+    counts = ", ".join(f"{count:,} {kind}" for count, kind in zip(study.ray_counts, RAY_KINDS, strict=True))
     title = f"{study.triangles:,} triangles, {counts} rays on {', '.join(study.devices)}"
     return [(title, [_row(study, row) for row in study.rows])]
 
@@ -299,7 +269,7 @@ def _row(study: HierarchiesStudy, row: HierarchyRow) -> dict[str, object]:
         "own_B/tri": row.hierarchy_bytes / study.triangles,
         "cost": row.cost,
     }
-    for kind, cost in zip(KINDS, row.rays, strict=True):
+    for kind, cost in zip(RAY_KINDS, row.rays, strict=True):
         found[f"{kind}_boxes"], found[f"{kind}_tris"] = cost.boxes, cost.triangles
         found[f"{kind}_Mrays/s"], found[f"{kind}_ratio"] = cost.rate / 1e6, cost.ratio
     found |= {"judged": row.judged, "wrong": row.disagreements, "leaks": row.leaks}
@@ -309,17 +279,7 @@ def _row(study: HierarchiesStudy, row: HierarchyRow) -> dict[str, object]:
 def plot(study: HierarchiesStudy, target: str | Path | IO[bytes], title: str = "") -> int:
     """Draw the study as a PNG picture: memory, cost, tests and rays a second.
 
-    Args:
-        study: What was found.
-        target: A path, written whole or not at all, or a binary stream.
-        title: The model's name.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        WriteError: The file could not be written.
+    Target, title, result and errors are those of `plots.plot_study`.
     """
     figure = require_plots().Figure(figsize=(14, 9), dpi=110, layout="constrained")
     memory, cost, boxes, triangles, rate, build = figure.subplots(2, 3, sharey=True).reshape(-1)
@@ -331,17 +291,15 @@ def plot(study: HierarchiesStudy, target: str | Path | IO[bytes], title: str = "
         (boxes, "boxes", "boxes, planes, slabs tested by a ray"),
         (triangles, "triangles", "triangles tested by a ray"),
     ):
-        _bars(axes, rows, [[getattr(r.rays[k], name) for r in rows] for k in range(len(KINDS))], _COLOURS)
+        _bars(axes, rows, [[getattr(r.rays[k], name) for r in rows] for k in range(len(RAY_KINDS))], _COLOURS)
         axes.set_title(what, fontsize=10)
-    _bars(rate, rows, [[r.rays[k].rate / 1e6 for r in rows] for k in range(len(KINDS))], _COLOURS)
+    _bars(rate, rows, [[r.rays[k].rate / 1e6 for r in rows] for k in range(len(RAY_KINDS))], _COLOURS)
     rate.set_title("million rays a second, fastest run", fontsize=10)
     _bars(build, rows, [[row.build_seconds for row in rows]], ["#1b6ca8"])
     build.set_title("build, seconds", fontsize=10)
-    rate.legend(KINDS, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False)
-    memory.set_yticks(range(len(rows)), [row.name for row in rows])
-    memory.set_ylim(len(rows) - 0.4, -0.6)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}{count:,} triangles under each hierarchy")
+    legend_below(rate, columns=3, labels=RAY_KINDS)
+    name_rows(memory, [row.name for row in rows])
+    figure.suptitle(titled(title, f"{count:,} triangles under each hierarchy"))
     return save_figure(figure, target)
 
 
@@ -349,7 +307,7 @@ def _plot_memory(axes: "Axes", study: HierarchiesStudy) -> None:
     place = np.arange(len(study.rows))
     own = [row.hierarchy_bytes / study.triangles for row in study.rows]
     whole = [(row.file_bytes or 0) / study.triangles for row in study.rows]
-    axes.barh(place, whole, 0.72, color="#b9bdc4")
+    axes.barh(place, whole, 0.72, color=LIGHT)
     axes.barh(place, own, 0.72, color="#1b6ca8")
     for y, (part, total) in enumerate(zip(own, whole, strict=True)):
         text = f" {part:.3g} of {total:.3g}" if total else f" {part:.3g}, no file"

@@ -20,8 +20,15 @@ import numpy as np
 
 from striptools.hierarchies.kdtree import KdTree, build_kdtree
 from striptools.hierarchies.options import HierarchyOptions, MetricName, OverName
-from striptools.measure.plots import require_plots, save_figure
-from striptools.measure.study import RaySet, StudyOptions, study_rays, tell_no_one, timed_in_turn
+from striptools.measure.plots import legend_below, name_rows, require_plots, save_figure, titled
+from striptools.measure.study import (
+    RaySet,
+    StudyOptions,
+    ray_counters,
+    study_rays,
+    tell_no_one,
+    timed_in_turn,
+)
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert
@@ -162,8 +169,7 @@ def _tracer(scene: Scene, tree: KdTree, mailbox: int, options: StudyOptions) -> 
 
 def _count(tracer: Tracer, rays: RaySet) -> tuple[int, int]:
     """Tests of triangles and steps of all rays."""
-    counters = tracer.closest_hit(rays.origins, rays.directions, counters=True).counters
-    assert counters is not None
+    counters = ray_counters(tracer, rays)
     return int(counters.triangles.sum(dtype=np.int64)), int(counters.steps.sum(dtype=np.int64))
 
 
@@ -243,17 +249,7 @@ def _tree(trial: KdTrial) -> dict[str, object]:
 def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int:
     """Draw what the correction changes as a PNG picture: tests, steps and time, beside Hunt's.
 
-    Args:
-        found: By the study.
-        target: A path, written whole or not at all, or a binary stream.
-        title: The model's name.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        WriteError: The file could not be written.
+    Target, title, result and errors are those of `plots.plot_study`.
     """
     figure = require_plots().Figure(figsize=(12, 4.5), dpi=110, layout="constrained")
     panels = figure.subplots(1, 3, sharey=True).reshape(-1)
@@ -270,11 +266,9 @@ def plot(found: KdStudy, target: str | Path | IO[bytes], title: str = "") -> int
         hunt = 100 * change(getattr(PAPER[0], name), getattr(PAPER[1], name))
         axes.axvline(hunt, color="#c8553d", linestyle="--", label="Hunt, FForest020")
         axes.set_title(f"{name}: change by the correction, %", fontsize=10)
-    panels[0].set_yticks(place, [f"{one.over}, mail-box {one.mailbox}" for one, _ in each])
-    panels[0].set_ylim(len(each) - 0.4, -0.6)
-    panels[1].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, frameon=False)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}kd-trees by the plain and by the corrected surface area metric")
+    name_rows(panels[0], [f"{one.over}, mail-box {one.mailbox}" for one, _ in each])
+    legend_below(panels[1], columns=3, drop=0.08)
+    figure.suptitle(titled(title, "kd-trees by the plain and by the corrected surface area metric"))
     return save_figure(figure, target)
 
 

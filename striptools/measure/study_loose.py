@@ -30,10 +30,13 @@ from striptools.hierarchies.options import HierarchyOptions, OverName
 from striptools.hierarchies.strip_bvh import StripHierarchy
 from striptools.measure.quality import full_tree_cost
 from striptools.measure.study import (
+    RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
-    rate_and_ratio,
-    study_rays,
+    mean_counters,
+    rates_and_ratios,
+    rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
 )
@@ -48,10 +51,7 @@ from striptools.trace.counters import Counters
 from striptools.trace.single import triangles_of_objects
 from striptools.types import Boxes, Counts
 
-__all__ = ["BUILDS", "KINDS", "LooseRow", "LooseStudy", "RayCost", "study", "tables"]
-
-KINDS = ("camera", "AO", "random")
-"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
+__all__ = ["BUILDS", "LooseRow", "LooseStudy", "RayCost", "study", "tables"]
 
 LOOSE, LINEAR, SAH = BUILDS = ("loose octree", "LBVH", "binned SAH")
 
@@ -90,7 +90,7 @@ class LooseRow:
         lead: Seconds of the SAH build over these: the median of the runs' ratios.
         node_bytes: Bytes of its nodes.
         relative_cost: Expected cost over that of a full binned SAH tree over the triangles.
-        rays: What rays cost, by `KINDS`.
+        rays: What rays cost, by `RAY_KINDS`.
     """
 
     build: str
@@ -104,21 +104,8 @@ class LooseRow:
     rays: tuple[RayCost, ...]
 
 
-@dataclass(frozen=True)
-class LooseStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind in a run.
-        devices: What it was traced on.
-        rows: For triangles, then for strips, a row of each build.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[LooseRow, ...]
+LooseStudy = KindsStudy[LooseRow]
+"""What the study found: for triangles, then for strips, a row of each build."""
 
 
 def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | None = None) -> LooseStudy:
@@ -150,16 +137,15 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
         for (name, over), one in walked.items()
     }
     first = tracers[f"{LOOSE}, triangles"]
-    rays = (*study_rays(scene, first, options), _random_rays(scene, options.side**2 // 4))
-    counted = {key: _counted(tracer, rays) for key, tracer in tracers.items()}
+    rays = rays_of_each_kind(scene, first, options)
+    counted = {key: [mean_counters(tracer, part) for part in rays] for key, tracer in tracers.items()}
     times = timed_in_turn(tracers, rays, options.runs, tell)
     rows = []
     for (name, over), part in built.items():
         key, reference = f"{name}, {over}", f"{SAH}, {over}"
         costs = _costs(rays, counted[key], times[key], times[reference])
         rows.append(_row(name, over, part, built[SAH, over], full_cost, costs))
-    devices = tuple(str(device) for device in first.devices)
-    return LooseStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
+    return LooseStudy.of(scene, first, rays, rows)
 
 
 @dataclass(frozen=True)
@@ -213,31 +199,13 @@ def _cost_of(hierarchy: LooseBvh, starts: Counts, triangle_boxes: Boxes) -> floa
     return expected_cost(tree.boxes, tree.size)
 
 
-def _random_rays(scene: Scene, count: int) -> RaySet:
-    random = np.random.default_rng(1)
-    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
-    origins = low + (high - low) * random.random((count, 3))
-    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
-
-
-def _counted(tracer: Tracer, rays: tuple[RaySet, ...]) -> list[Counters]:
-    """What rays of each kind count, on the average."""
-    found = []
-    for part in rays:
-        counters = tracer.closest_hit(part.origins, part.directions, counters=True).counters
-        assert counters is not None
-        found.append(Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters)))
-    return found
-
-
 def _costs(
     rays: tuple[RaySet, ...], counted: list[Counters], seconds: np.ndarray, of_sah: np.ndarray
 ) -> tuple[RayCost, ...]:
-    costs = []
-    for kind, (part, counters) in enumerate(zip(rays, counted, strict=True)):
-        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_sah[:, kind])
-        costs.append(RayCost(rate, 1 / lead, counters.boxes + counters.triangles, counters.triangles))
-    return tuple(costs)
+    return tuple(
+        RayCost(*rates, each.boxes + each.triangles, each.triangles)
+        for rates, each in zip(rates_and_ratios(rays, seconds, of_sah), counted, strict=True)
+    )
 
 
 def _row(
@@ -258,7 +226,7 @@ def tables(study: LooseStudy) -> list[tuple[str, list[dict[str, object]]]]:
     parts: list[tuple[str, list[dict[str, object]]]] = [
         (title, [_hierarchy(study, row) for row in study.rows])
     ]
-    for kind, name in enumerate(KINDS):
+    for kind, name in enumerate(RAY_KINDS):
         heading = f"{study.ray_counts[kind]:,} {name} rays; ratio: rays a second over those of {SAH}"
         parts.append((heading, [_rays(row, row.rays[kind]) for row in study.rows]))
     return parts

@@ -21,14 +21,15 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 
 from striptools.hierarchies.presorted import EVERY_LEVEL, Presorted, level_limit, presort
-from striptools.measure.plots import require_plots, save_figure
+from striptools.measure.plots import LIGHT, legend_below, require_plots, save_figure, titled
 from striptools.measure.study import (
-    RaySet,
     StudyOptions,
-    rate_and_ratio,
+    mean_counters,
+    rates_and_ratios,
     study_rays,
     tell_no_one,
     timed_in_turn,
+    wide_bytes,
 )
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import convert
@@ -66,7 +67,7 @@ PAPER = {
 WIDE = "wide SAH"
 """The default walk's name."""
 
-_PRIMARY, _SECONDARY, _LIGHT = "#1b6ca8", "#c8553d", "#b9bdc4"
+_PRIMARY, _SECONDARY = "#1b6ca8", "#c8553d"
 
 
 @dataclass(frozen=True)
@@ -211,14 +212,16 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     entries = _entries(scene, options, tell)
     tracers = {str(place): entry.tracer for place, entry in enumerate(entries)}
     rays = study_rays(scene, entries[-1].tracer, options)
-    counted = [_counted(entry.tracer, rays, tell, k / len(entries)) for k, entry in enumerate(entries)]
+    counted = []
+    for entry in entries:
+        tell("compile", len(counted) / len(entries))
+        counted.append([mean_counters(entry.tracer, part) for part in rays])
     times = [*timed_in_turn(tracers, rays, options.runs, tell).values()]
     whole = times[[(entry.levels, entry.node_test) for entry in entries].index((EVERY_LEVEL, "bandwidth"))]
     rows = []
     for entry, seconds, counters in zip(entries, times, counted, strict=True):
-        primary, secondary = (
-            _traced(rays[kind], seconds[:, kind], whole[:, kind], counters[kind]) for kind in range(2)
-        )
+        rates = rates_and_ratios(rays, seconds, whole)
+        primary, secondary = (Traced(*rate, *_costs(k)) for rate, k in zip(rates, counters, strict=True))
         facts = (entry.levels, entry.node_test, entry.node_bytes, entry.trees)
         rows.append(PresortedRow(*facts, primary, secondary))
     counts = [len(part.origins) for part in rays]
@@ -240,30 +243,15 @@ def _entries(scene: Scene, options: StudyOptions, tell: Watch) -> list[_Entry]:
             size, trees = presorted.nodes.nbytes, len(presorted.starts) - 1
             entries.append(_Entry(levels, node_test, size, trees, _tracer(layout, options)))
     layout = lay_out_rebuilt(scene, threads)
-    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
-    size = int(used.sum()) * layout.arrays.nodes[0].nbytes
-    return [*entries, _Entry(None, None, size, 0, _tracer(layout, options))]
+    return [*entries, _Entry(None, None, wide_bytes(layout), 0, _tracer(layout, options))]
 
 
 def _tracer(layout: Layout, options: StudyOptions) -> Tracer:
     return Tracer.of_layout(layout, device=options.device, threads=options.threads)
 
 
-def _counted(tracer: Tracer, rays: tuple[RaySet, RaySet], tell: Watch, done: float) -> list[Counters]:
-    """What rays of both kinds count, on the average."""
-    tell("compile", done)
-    found = []
-    for part in rays:
-        hits = tracer.closest_hit(part.origins, part.directions, counters=True)
-        assert hits.counters is not None
-        found.append(Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in hits.counters)))
-    return found
-
-
-def _traced(rays: RaySet, seconds: np.ndarray, of_whole: np.ndarray, counters: Counters) -> Traced:
-    rate, lead = rate_and_ratio(len(rays.origins), seconds, of_whole)
-    costs = (counters.boxes, counters.triangles, counters.node_bytes, counters.geometry_bytes)
-    return Traced(rate, 1 / lead, *costs)
+def _costs(counters: Counters) -> tuple[float, float, float, float]:
+    return counters.boxes, counters.triangles, counters.node_bytes, counters.geometry_bytes
 
 
 def tables(study: PresortedStudy) -> list[tuple[str, list[dict[str, object]]]]:
@@ -316,17 +304,7 @@ def _node_test(row: PresortedRow) -> dict[str, object]:
 def plot(study: PresortedStudy, target: str | Path | IO[bytes], title: str = "") -> int:
     """Draw a study as a PNG picture: memory, tests a ray and rays a second, by levels.
 
-    Args:
-        study: What was found.
-        target: A path, written whole or not at all, or a binary stream.
-        title: The model's name.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        WriteError: The file could not be written.
+    Target, title, result and errors are those of `plots.plot_study`.
     """
     figure = require_plots().Figure(figsize=(15, 5), dpi=110, layout="constrained")
     memory, tests, rate = figure.subplots(1, 3)
@@ -335,8 +313,7 @@ def plot(study: PresortedStudy, target: str | Path | IO[bytes], title: str = "")
     tests.set_title("boxes, slabs and triangles tested by a ray", fontsize=10)
     _plot_curves(rate, study, "rate", 1e6)
     rate.set_title("traced rays, millions a second (fastest run)", fontsize=10)
-    name = f"{title}: " if title else ""
-    figure.suptitle(f"{name}{study.triangles:,} triangles, presorted under plain SAH levels")
+    figure.suptitle(titled(title, f"{study.triangles:,} triangles, presorted under plain SAH levels"))
     return save_figure(figure, target)
 
 
@@ -344,7 +321,7 @@ def _plot_memory(axes: "Axes", study: PresortedStudy) -> None:
     rows = [row for row in study.by_levels if row.levels in LEVELS]
     for place, sizes in enumerate(PAPER.values()):
         label = f"the paper's {len(PAPER)} scenes" if place == 0 else None
-        axes.plot(LEVELS, sizes, color=_LIGHT, linewidth=0.9, label=label)
+        axes.plot(LEVELS, sizes, color=LIGHT, linewidth=0.9, label=label)
     axes.plot(LEVELS, [level_limit(n) / 1000 for n in LEVELS], color="#222222", linestyle=":", label="limit")
     axes.plot(LEVELS, [row.node_bytes / 1000 for row in rows], color=_PRIMARY, marker="o", label="this model")
     whole = study.both_tests(EVERY_LEVEL)[0]
@@ -373,7 +350,7 @@ def _plot_curves(axes: "Axes", study: PresortedStudy, what: str, unit: float) ->
 
 def _finish(axes: "Axes") -> None:
     axes.set_xlabel("plain levels", fontsize=9)
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+    legend_below(axes, columns=2, drop=0.12)
 
 
 # Notes. Rays a second over those of the whole SAH BVH in the same walk, primary/secondary, by plain levels,

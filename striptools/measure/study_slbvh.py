@@ -17,12 +17,16 @@ import numpy as np
 from striptools.hierarchies.options import BalanceName, HierarchyOptions, OverName
 from striptools.hierarchies.slbvh import Slbvh, build_slbvh
 from striptools.measure.study import (
+    RAY_KINDS,
+    KindsStudy,
     RaySet,
     StudyOptions,
-    rate_and_ratio,
-    study_rays,
+    mean_counters,
+    rates_and_ratios,
+    rays_of_each_kind,
     tell_no_one,
     timed_in_turn,
+    wide_bytes,
 )
 from striptools.mesh.mesh import Mesh
 from striptools.partition.boxes import range_boxes
@@ -34,10 +38,7 @@ from striptools.trace import Tracer
 from striptools.trace.counters import Counters
 from striptools.trace.leaves import lay_out
 
-__all__ = ["KINDS", "RayCost", "SlbvhRow", "SlbvhStudy", "study", "tables"]
-
-KINDS = ("camera", "AO", "random")
-"""Rays of a camera; one from each of their hits; from anywhere in the bounds in any direction."""
+__all__ = ["RayCost", "SlbvhRow", "SlbvhStudy", "study", "tables"]
 
 BALANCES: tuple[BalanceName, ...] = ("sah", "morton")
 OVERS: tuple[OverName, ...] = ("triangles", "strips", "blocks")
@@ -83,7 +84,7 @@ class SlbvhRow:
         node_bytes: Bytes of all nodes, empty ones included.
         empty: The share of nodes that are empty; 0 for the wide walk, which has none.
         state_bytes: Bytes that a ray keeps to find its way.
-        rays: What rays cost, by `KINDS`.
+        rays: What rays cost, by `RAY_KINDS`.
     """
 
     balance: BalanceName | None
@@ -97,21 +98,8 @@ class SlbvhRow:
     rays: tuple[RayCost, ...]
 
 
-@dataclass(frozen=True)
-class SlbvhStudy:
-    """What the study found.
-
-    Attributes:
-        triangles: Triangles of the scene.
-        ray_counts: Rays of each kind in a run.
-        devices: What it was traced on.
-        rows: The wide walk, then balance by balance.
-    """
-
-    triangles: int
-    ray_counts: tuple[int, ...]
-    devices: tuple[str, ...]
-    rows: tuple[SlbvhRow, ...]
+SlbvhStudy = KindsStudy[SlbvhRow]
+"""What the study found: a row of the wide walk, then balance by balance."""
 
 
 def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | None = None) -> SlbvhStudy:
@@ -131,8 +119,8 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
     tell("convert", 0.0)
     scene = convert(mesh, replace(options.options, instances=False))
     wide = Tracer(scene, device=options.device, threads=options.threads)
-    rays = (*study_rays(scene, wide, options), _random_rays(scene, options.side**2 // 4))
-    counted = _counted(wide, rays)
+    rays = rays_of_each_kind(scene, wide, options)
+    counted = [mean_counters(wide, part) for part in rays]
     rows = []
     for balance in BALANCES:
         for over in OVERS:
@@ -141,19 +129,11 @@ def study(mesh: Mesh, options: StudyOptions | None = None, *, watch: Watch | Non
             walked = replace(scene, hierarchy=slbvh)
             tracer = Tracer(walked, device=options.device, threads=options.threads)
             times = timed_in_turn({WIDE: wide, HEAP: tracer}, rays, options.runs, tell)
-            costs = _costs(rays, _counted(tracer, rays), times[HEAP], times[WIDE])
+            costs = _costs(rays, [mean_counters(tracer, part) for part in rays], times[HEAP], times[WIDE])
             rows.append(_row(slbvh, balance, seconds, costs))
             if len(rows) == 1:
                 rows.insert(0, _wide_row(scene, _costs(rays, counted, times[WIDE], times[WIDE])))
-    devices = tuple(str(device) for device in wide.devices)
-    return SlbvhStudy(scene.triangle_count, tuple(len(r.origins) for r in rays), devices, tuple(rows))
-
-
-def _random_rays(scene: Scene, count: int) -> RaySet:
-    random = np.random.default_rng(1)
-    low, high = scene.low.astype(np.float64), scene.high.astype(np.float64)
-    origins = low + (high - low) * random.random((count, 3))
-    return RaySet(origins.astype(np.float32), random.normal(size=(count, 3)).astype(np.float32))
+    return SlbvhStudy.of(scene, wide, rays, rows)
 
 
 def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> tuple[Slbvh, float]:
@@ -166,25 +146,13 @@ def _built(scene: Scene, balance: BalanceName, over: OverName, threads: int) -> 
     return slbvh, time.perf_counter() - start
 
 
-def _counted(tracer: Tracer, rays: tuple[RaySet, ...]) -> list[Counters]:
-    """What rays of each kind count, on the average."""
-    found = []
-    for part in rays:
-        counters = tracer.closest_hit(part.origins, part.directions, counters=True).counters
-        assert counters is not None
-        found.append(Counters(*(float(np.mean(each)) if len(each) else 0.0 for each in counters)))
-    return found
-
-
 def _costs(
     rays: tuple[RaySet, ...], counted: list[Counters], seconds: np.ndarray, of_wide: np.ndarray
 ) -> tuple[RayCost, ...]:
-    costs = []
-    for kind, (part, counters) in enumerate(zip(rays, counted, strict=True)):
-        rate, lead = rate_and_ratio(len(part.origins), seconds[:, kind], of_wide[:, kind])
-        read = counters.node_bytes + counters.geometry_bytes
-        costs.append(RayCost(rate, 1 / lead, counters.boxes, counters.triangles, read))
-    return tuple(costs)
+    return tuple(
+        RayCost(*rates, each.boxes, each.triangles, each.node_bytes + each.geometry_bytes)
+        for rates, each in zip(rates_and_ratios(rays, seconds, of_wide), counted, strict=True)
+    )
 
 
 def _row(slbvh: Slbvh, balance: BalanceName, seconds: float, costs: tuple[RayCost, ...]) -> SlbvhRow:
@@ -197,8 +165,7 @@ def _row(slbvh: Slbvh, balance: BalanceName, seconds: float, costs: tuple[RayCos
 def _wide_row(scene: Scene, costs: tuple[RayCost, ...]) -> SlbvhRow:
     """The default walk; its nodes are laid out from the scene's own, so that there is no build to time."""
     layout = lay_out(scene)
-    used = np.isfinite(layout.arrays.nodes[:, 0]).any(axis=1)
-    size = int(used.sum()) * layout.arrays.nodes[0].nbytes
+    size = wide_bytes(layout)
     stack = ENTRY_BYTES * (layout.depth + 2)
     return SlbvhRow(None, "triangles", scene.triangle_count, layout.depth, None, size, 0.0, stack, costs)
 
@@ -209,7 +176,7 @@ def tables(study: SlbvhStudy) -> list[tuple[str, list[dict[str, object]]]]:
     parts: list[tuple[str, list[dict[str, object]]]] = [
         (title, [_hierarchy(study, row) for row in study.rows])
     ]
-    for kind, name in enumerate(KINDS):
+    for kind, name in enumerate(RAY_KINDS):
         rays = f"{study.ray_counts[kind]:,} {name} rays; ratios are to the wide walk"
         parts.append((rays, [_rays(row, row.rays[kind]) for row in study.rows]))
     return parts

@@ -204,12 +204,6 @@ class Trade:
         return asdict(self)
 
 
-def trade_from_dict(facts: dict[str, Any]) -> Trade:
-    """A trade from what `Trade.to_dict` gave."""
-    points = tuple(Point(**row) for row in facts["points"])
-    return Trade(**{**facts, "rays": tuple(facts["rays"]), "points": points})
-
-
 def trade(
     mesh: Mesh,
     options: TradeOptions | None = None,

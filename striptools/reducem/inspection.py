@@ -68,8 +68,3 @@ class Inspection:
             more = f" (the first of {count})" if count > 1 else ""
             self.found(code, place(first) + more, offset(first))
         return count > 0
-
-    @property
-    def has_errors(self) -> bool:
-        """Whether a finding so far makes the file invalid."""
-        return any(finding.issue.severity == "error" for finding in self.findings)

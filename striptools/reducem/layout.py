@@ -103,6 +103,11 @@ def _record(name: str, *fields: tuple[str, str]) -> Record:
     return Record(name, tuple(made))
 
 
+def _box(kind: str) -> list[tuple[str, str]]:
+    """The fields of a box of such numbers."""
+    return [(kind, f"{end}_{axis}") for end in ("low", "high") for axis in "xyz"]
+
+
 HEADER = _record(
     "file header",
     ("S8", "magic"),
@@ -137,12 +142,7 @@ SCENE_RECORD = _record(
     ("<i2", "grid_exponent"),
     ("<u4", "reserved_2"),
     ("<f8", "error_bound"),
-    ("<f4", "low_x"),
-    ("<f4", "low_y"),
-    ("<f4", "low_z"),
-    ("<f4", "high_x"),
-    ("<f4", "high_y"),
-    ("<f4", "high_z"),
+    *_box("<f4"),
     ("<i2", "cell_x"),
     ("<i2", "cell_y"),
     ("<i2", "cell_z"),
@@ -179,12 +179,7 @@ NODE_RECORD = _record(
     ("<u2", "origin_z"),
     ("u1", "inner"),
     ("u1", "shifts"),
-    ("8u1", "low_x"),
-    ("8u1", "low_y"),
-    ("8u1", "low_z"),
-    ("8u1", "high_x"),
-    ("8u1", "high_y"),
-    ("8u1", "high_z"),
+    *_box("8u1"),
 )
 ATTRIBUTE = _record(
     "attribute record",
@@ -218,22 +213,12 @@ HIERARCHY_RECORD = _record(
     ("<u4", "node_count"),
     ("<u4", "item_count"),
     ("<u4", "reserved_2"),
-    ("<f4", "low_x"),
-    ("<f4", "low_y"),
-    ("<f4", "low_z"),
-    ("<f4", "high_x"),
-    ("<f4", "high_y"),
-    ("<f4", "high_z"),
+    *_box("<f4"),
     ("24u1", "reserved_3"),
 )
 BOX_NODE = _record(
     "node with a box",
-    ("<f4", "low_x"),
-    ("<f4", "low_y"),
-    ("<f4", "low_z"),
-    ("<f4", "high_x"),
-    ("<f4", "high_y"),
-    ("<f4", "high_z"),
+    *_box("<f4"),
     ("<u4", "a"),
     ("<u4", "b"),
 )

@@ -54,11 +54,6 @@ def items_of(hierarchy: StoredHierarchy) -> np.ndarray | None:
     return hierarchy.starts if isinstance(hierarchy, Presorted) else hierarchy.order
 
 
-def node_width(hierarchy: StoredHierarchy) -> int:
-    """Words of a node."""
-    return 2 if isinstance(hierarchy, KdTree) else 8
-
-
 def hierarchy_length(hierarchy: StoredHierarchy | None) -> int:
     """Bytes of the section; 0 where there is none."""
     if hierarchy is None:

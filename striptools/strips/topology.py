@@ -164,32 +164,6 @@ def decode_strips(
     return faces
 
 
-def decode_triangle(
-    vertices: Counts, turns: Bools, starts: Counts, triangle: int, flips: Bools | None = None
-) -> tuple[int, int, int]:
-    """One triangle alone, read from its strip's own vertices and turn bits and its flip bit.
-
-    Args:
-        vertices: (n + 2 s,) int32.
-        turns: (n,) bool.
-        starts: (s+1,) int32.
-        triangle: Its place in file order.
-        flips: (n,) bool, or None.
-    """
-    strip = int(np.searchsorted(starts, triangle, side="right")) - 1
-    begin = int(starts[strip])
-    first = begin + 2 * strip
-    bits = turns[begin + 1 : triangle + 1][::-1]
-    places = []
-    for corner, bit in ((0, False), (1, True)):
-        back = np.flatnonzero(bits == bit)[:1]
-        places.append(first + (triangle - begin - int(back[0]) + 1 if len(back) else corner))
-    if flips is not None and flips[triangle]:
-        places.reverse()
-    last = first + triangle - begin + 2
-    return int(vertices[places[0]]), int(vertices[places[1]]), int(vertices[last])
-
-
 def without_flips(strips: Strips) -> Strips:
     """The same triangles in the same order, each strip cut where its flip bit changes, and no flips."""
     if strips.flips is None:
