@@ -1,5 +1,6 @@
 """The results file and the scripts: what is written comes back, what got worse is said, groups are run."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from striptools.measure.verify import VerifyOptions
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools_cli import bench as command
-from striptools_cli.app import main
 
+Run = Callable[..., tuple[int, str, str]]
 CLONE = Path(__file__).parent.parent
 CHANDELIER = CLONE / "samples" / "chandelier.ply"
 
@@ -196,38 +197,41 @@ def test_a_part_of_a_model_is_a_model(tmp_path: Path) -> None:
 
 
 def test_the_command_compares_and_ends_with_1_where_something_got_worse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     model, file = tmp_path / "one.ply", tmp_path / "bench.csv"
     model.write_bytes(part_of(CHANDELIER, tmp_path).read_bytes())
 
-    def run(value: str, *more: str, end: int = 0, needs: tuple[str, ...] = ()) -> tuple[int, str]:
+    def measured(value: str, *more: str, end: int = 0, needs: tuple[str, ...] = ()) -> tuple[int, str]:
         plan = {"full": [["--value", value]], "quick": [["--value", value]], "needs": needs}
         monkeypatch.setattr(command, "_CLONE", clone_with(tmp_path, plan, end))
-        code = main(["bench", str(model), "--results", str(file), "--only", "fake", *more])
-        return code, capsys.readouterr().err
+        code, _, said = run("bench", model, "--results", file, "--only", "fake", *more)
+        return code, said
 
-    assert run("10") == (0, "no earlier figures of this machine to compare with\n")
-    assert run("10") == (0, "nothing got worse\n")
-    code, said = run("11")
+    assert measured("10") == (0, "no earlier figures of this machine to compare with\n")
+    assert measured("10") == (0, "nothing got worse\n")
+    code, said = measured("11")
     assert code == 1
     assert said.startswith("worse: fake: one: size: 11 B, was 10 on ")
-    assert run("11", end=3)[0] == 1
-    assert "left out: fake (needs no_such_package)" in run("11", needs=("no_such_package",))[1]
+    code, said = measured("11", end=3)
+    assert (code, said) == (1, "failed: fake: ended with 3: it said nothing\n")
+    assert "left out: fake (needs no_such_package)" in measured("11", needs=("no_such_package",))[1]
     # With little time another model is measured, which has no earlier figures.
-    assert run("99", "--quick") == (0, "nothing got worse\n")
+    assert measured("99", "--quick") == (0, "nothing got worse\n")
     assert [row.mesh for row in rows_of(file)] == ["one"] * 4 + ["part_of_one"]
-    assert main(["bench", str(model), "--only", "nothing"]) == 2
-    assert "give one of package, fake" in capsys.readouterr().err
+    code, _, said = run("bench", model, "--only", "nothing")
+    assert code == 2
+    assert "give one of package, fake" in said
 
 
 def test_without_a_clone_the_package_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     monkeypatch.setattr(command, "_CLONE", tmp_path)
     model = part_of(CHANDELIER, tmp_path)
-    assert main(["bench", str(model), "--quick", "--results", str(tmp_path / "bench.csv")]) == 0
-    assert "in a clone's tests/benches" in capsys.readouterr().err
+    code, _, said = run("bench", model, "--quick", "--results", tmp_path / "bench.csv")
+    assert code == 0
+    assert "in a clone's tests/benches" in said
     assert {row.bench for row in rows_of(tmp_path / "bench.csv")} == {"package"}
 
 

@@ -1,6 +1,7 @@
 """`--max-error` takes the smallest precision whose bound keeps it: at each bound, just below, just above."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from striptools.pipeline import Options, convert
 from striptools.reducem import quantize
 from striptools.reducem.quantize import PrecisionOptions, quantise
 from striptools.reducem.reader import read_scene
-from striptools_cli.app import main
 
 BITS = range(8, 25)
 
@@ -121,13 +121,15 @@ def test_relative_errors_count_in_diagonals() -> None:
         assert found.grid_exponent == moved.grid_exponent
 
 
-def test_the_command_line_takes_the_number_as_it_is(tmp_path: Path) -> None:
+def test_the_command_line_takes_the_number_as_it_is(
+    tmp_path: Path, run: Callable[..., tuple[int, str, str]]
+) -> None:
     save_mesh(ball(), tmp_path / "ball.ply")
     for bits in (9, 14, 23):
         bound = convert(ball(), Options(precision=PrecisionOptions(bits))).error_bound
         for largest, there in ((bound, bits), (math.nextafter(bound, 0.0), bits + 1)):
-            files = [str(tmp_path / "ball.ply"), str(tmp_path / "ball.rdm")]
-            assert main(["convert", *files, "--max-error", repr(largest), "--force", "--quiet"]) == 0
+            files = (tmp_path / "ball.ply", tmp_path / "ball.rdm")
+            assert run("convert", *files, "--max-error", repr(largest), "--force", "--quiet")[0] == 0
             wanted = convert(ball(), Options(precision=PrecisionOptions(there))).grid_exponent
             assert read_scene(tmp_path / "ball.rdm").grid_exponent == wanted
 

@@ -1,5 +1,6 @@
 """Simplification: the share, the distance both ways against brute force, errors kept or refused."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from striptools.mesh.simplify import SimplifyOptions, simplify
 from striptools.mesh.surface_distance import Surface, deviation
 from striptools.pipeline import Options, convert, convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
-from striptools_cli.app import main
 
 pytest.importorskip("fast_simplification")
+
+Run = Callable[..., tuple[int, str, str]]
 
 
 def wavy(side: int = 24, height: float = 0.1) -> Mesh:
@@ -256,17 +258,20 @@ def test_nothing_strays_where_all_is_declared() -> None:
     assert not Strays(1.0, 2.1, 1.0, 2.0).ok
 
 
-def test_the_command_line_proves_what_it_simplified(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_line_proves_what_it_simplified(tmp_path: Path, run: Run) -> None:
     model, scene = tmp_path / "wavy.ply", tmp_path / "wavy.rdm"
     save_mesh(wavy(), model)
-    assert main(["convert", str(model), str(scene), "--simplify", "20%"]) == 0
-    assert "the source strays at most" in capsys.readouterr().out
-    rays = ["--rays", "16", "--aimed-rays", "64"]
-    assert main(["verify", str(scene), "--against", str(model), *rays]) == 0
-    said = capsys.readouterr().out
+    code, said, _ = run("convert", model, scene, "--simplify", "20%")
+    assert code == 0
+    assert "the source strays at most" in said
+    verify_it = ("verify", scene, "--against", model, "--rays", 16, "--aimed-rays", 64)
+    code, said, _ = run(*verify_it)
+    assert code == 0
     assert "no farther than declared" in said.splitlines()[0]
     save_mesh(wavy(height=0.2), model)
-    assert main(["verify", str(scene), "--against", str(model), *rays]) == 1
-    assert "FARTHER than declared" in capsys.readouterr().out.splitlines()[0]
-    assert main(["convert", str(model), "b.rdm", "--simplify", "5%", "--simplify-error", "1e-6"]) == 2
-    assert "stray by up to" in capsys.readouterr().err
+    code, said, _ = run(*verify_it)
+    assert code == 1
+    assert "FARTHER than declared" in said.splitlines()[0]
+    code, _, said = run("convert", model, tmp_path / "b.rdm", "--simplify", "5%", "--simplify-error", "1e-6")
+    assert code == 2
+    assert "stray by up to" in said
