@@ -103,17 +103,18 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("script", scripts(CLONE), ids=lambda script: script.group)
 def test_each_script_says_how_it_is_called(script) -> None:
-    assert script.takes in ("paths", "folder", "named")
     assert script.full
-    assert script.quick
     text = script.path.read_text()
     for run in (*script.full, *script.quick):
         for flag in (word for word in (*run, "--record") if word.startswith("--")):
             assert f'add_argument("{flag}"' in text
-    taken = {"paths": ('"models"', '"meshes"'), "folder": ('"folder"',), "named": ('"folders"',)}[
-        script.takes
-    ]
-    assert any(f"add_argument({name}" in text for name in taken)
+    taken = {
+        "paths": ["models", "meshes"],
+        "folder": ["folder"],
+        "named": ["folders"],
+        "nothing": ["--record"],
+    }
+    assert any(f'add_argument("{name}"' in text for name in taken[script.takes])
 
 
 def test_what_the_results_hold_is_measured_by_a_script_or_here() -> None:
@@ -167,6 +168,7 @@ def test_models_are_named_as_a_script_takes_them(tmp_path: Path) -> None:
         ("paths", [[str(path) for path in models]]),
         ("folder", [[str(tmp_path), "a"], [str(tmp_path / "more"), "c"]]),
         ("named", [[str(tmp_path), "--mesh", "a"], [str(tmp_path / "more"), "--mesh", "c"]]),
+        ("nothing", [[]]),
     ):
         (script,) = scripts(clone_with(tmp_path, {"takes": takes, "full": [["--x"]], "quick": []}))
         calls = list(script.calls(models, quick=False))
@@ -215,6 +217,9 @@ def test_the_command_compares_and_ends_with_1_where_something_got_worse(
     assert said.startswith("worse: fake: one: size: 11 B, was 10 on ")
     code, said = measured("11", end=3)
     assert (code, said) == (1, "failed: fake: ended with 3: it said nothing\n")
+    monkeypatch.setattr(command, "_CLONE", clone_with(tmp_path, {"full": [[]]}))
+    said = run("bench", model, "--quick", "--only", "fake", "--results", file)[2]
+    assert "left out: fake (takes long)" in said
     assert "left out: fake (needs no_such_package)" in measured("11", needs=("no_such_package",))[1]
     # With little time another model is measured, which has no earlier figures.
     assert measured("99", "--quick") == (0, "nothing got worse\n")

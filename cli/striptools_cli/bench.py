@@ -94,7 +94,7 @@ def run(
     if not said and not quiet:
         said = ["nothing got worse" if before else "no earlier figures of this machine to compare with"]
     if not quiet:
-        said += _left_out(groups)
+        said += _left_out(groups, quick=quick)
     say("".join(f"{line}\n" for line in said), error=True)
     raise typer.Exit(EXIT_ISSUES if wrong or worse else EXIT_DONE)
 
@@ -132,11 +132,14 @@ def _measured(
     return rows, wrong
 
 
-def _left_out(groups: dict[str, Script | None]) -> list[str]:
+def _left_out(groups: dict[str, Script | None], *, quick: bool) -> list[str]:
     """What could not be measured, in a line or two."""
     missing = {name: script.missing() for name, script in groups.items() if script}
     lines = []
     left = [f"{name} (needs {', '.join(what)})" for name, what in missing.items() if what]
+    left += [
+        f"{name} (takes long)" for name, script in groups.items() if quick and script and not script.quick
+    ]
     if left:
         lines.append(f"left out: {'; '.join(left)}")
     absent = {peer for script in groups.values() if script for peer in script.absent()}

@@ -3,10 +3,10 @@
 A script is tests/benches/bench_GROUP.py. It says by a literal `BENCH`, which is read and never run, how it is
 called:
 
-    takes   "paths" of models, a "folder" and names in it, or "named" for names behind --mesh
+    takes   "paths" of models, a "folder" and names in it, "named" for names behind --mesh, or "nothing"
     models  names of those that the project's figures are of; without it, any
     full    lists of arguments, a run each
-    quick   the same where little time is given
+    quick   the same where little time is given; none where that is not enough
     needs   packages without which it cannot run, or "gpu"
     peers   packages that it measures beside, where they are there
 
@@ -54,7 +54,7 @@ class Script:
 
     group: str
     path: Path
-    takes: Literal["paths", "folder", "named"]
+    takes: Literal["paths", "folder", "named", "nothing"]
     models: tuple[str, ...]
     full: tuple[tuple[str, ...], ...]
     quick: tuple[tuple[str, ...], ...]
@@ -80,8 +80,8 @@ class Script:
                 yield [str(self.path), *given, *arguments, "--record"]
 
     def _given(self, models: list[Path]) -> Iterator[list[str]]:
-        if self.takes == "paths":
-            yield [str(path) for path in models]
+        if self.takes in ("paths", "nothing"):
+            yield [str(path) for path in models if self.takes == "paths"]
             return
         # Scripts that take a folder read .ply files in it.
         for folder in sorted({path.parent for path in models}):
