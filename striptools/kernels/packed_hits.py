@@ -229,10 +229,11 @@ def weigh_packed_hits(
         scale_exponent: Its exponent.
         t: (r,) float32, written.
         face: (r,) int32, written.
-        u: (r,) float32, written: the weight of the face's second corner.
-        v: (r,) float32, written: the weight of its third corner.
+        u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
+        v: (r,) float32, written: the weight of its third corner; or (0,).
         triangle: (r,) int32, written; -1 on a miss.
     """
+    weighed = len(u) > 0
     decoded = np.zeros((3, 3), np.float32)
     room = np.zeros(ROOM, np.float32)
     ray_of = np.zeros(CHUNK, np.int32)
@@ -242,17 +243,17 @@ def weigh_packed_hits(
         r = at[k]
         if r >= 0:
             t[r] = found_t[k]
-            if found[k] < 0:
-                face[r] = found[k]
-                triangle[r] = -1
+            block = np.int64(found[k]) >> 8
+            number = np.int64(-1)
+            face[r] = found[k]
+            if block >= 0:
+                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
+                face[r] = faces[number] if len(faces) > 0 else number
+            triangle[r] = number
+            if weighed and block < 0:
                 u[r] = 0.0
                 v[r] = 0.0
-            else:
-                block = np.int64(found[k]) >> 8
-                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
-                triangle[r] = number
-                face[r] = faces[number] if len(faces) > 0 else number
-
+            elif weighed:
                 # Decode the triangle, and turn it as the tests do.
                 bit = np.int64(headers[block, 1]) << 5
                 counts = block_counts(headers, block)

@@ -105,10 +105,11 @@ def weigh_hits(
         triangle_of: (f,) int32, the triangle in file order of each face.
         t: (r,) float32, written.
         face: (r,) int32, written.
-        u: (r,) float32, written: the weight of the face's second corner.
-        v: (r,) float32, written: the weight of its third corner.
+        u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
+        v: (r,) float32, written: the weight of its third corner; or (0,).
         triangle: (r,) int32, written; -1 on a miss.
     """
+    weighed = len(u) > 0
     room = np.zeros(ROOM, np.float32)
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
@@ -119,12 +120,11 @@ def weigh_hits(
             t[r] = found_t[k]
             name = found_face[k]
             face[r] = name
-            if name < 0:
+            triangle[r] = triangle_of[name] if name >= 0 else -1
+            if weighed and name < 0:
                 u[r] = 0.0
                 v[r] = 0.0
-                triangle[r] = -1
-            else:
-                triangle[r] = triangle_of[name]
+            elif weighed:
                 slot = place[name]
                 kx, ky, kz = take_ray(origins, directions, r, room, held)
                 block, lane = slot >> 5, (slot >> 2) & 7

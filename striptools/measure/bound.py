@@ -63,7 +63,8 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    float32 mesh counts as the source, and the rounding is told by the conversion's report.)
 9. A box. With the tracer's own order of operations a sheared coordinate near 0 has four roundings (a_x, a_z,
    S, the product), so it moves by at most gamma_4 M, M <= 2 L with L the largest coordinate of ray and scene;
-   a face whose corners straddle the ray after that lies within gamma_4 M of it in x and in y. A certain face
+   some point of a face that is accepted lies within gamma_4 2 L of the ray in x and in y, wherever the ray
+   goes through it (`trace.box`, How far: 8uL). A certain face
    needs no more than the slab test's own rounding, since the exact ray meets its box; the widening is for
    faces that are accepted by rounding, so that every hierarchy finds the same: `trace.box` and
    `trace.walk_packed` derive theirs. `beyond_box` tells how much a reported hit needed.

@@ -22,7 +22,7 @@ distance to it, with margin m, is computed as
 In units of position, with u = 2^-24 and M the largest of |o| and the scene's coordinates, rounding o + m and
 taking L away and multiplying by v moves it by at most u (M + 2 * 2M); the product with K by u 2M, none of it
 where fused. The last sum is relative to the distance itself, which `box.FAR_FACTOR` allows for. That is 7 uM,
-and the triangle test needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that
+and the triangle test needs 8 uM more (`box.REACH`): `MARGIN` is 32 uM, a power of two. A cell that
 would be denormal counts as zero: its planes move by less than 2^-100.
 """
 

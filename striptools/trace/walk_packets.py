@@ -16,7 +16,7 @@ Differences:
 
 **Boxes.** With u = 2^-24 and M the largest of origins and scene, distances along the axis are off by at most
 2uM, a slope (at most 1, widened by 8u) times one by 3uM more, sums by 2uM: 7uM, and the triangle test needs
-6uM. `MARGIN` is 16uM for expanded scenes.
+8uM (`box.REACH`); sides of packed boxes are rounded too, by uM. The margin is 32uM (`layout.PACKET_MARGIN`).
 
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """

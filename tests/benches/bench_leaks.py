@@ -23,6 +23,14 @@ from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
 
+BENCH = {
+    "takes": "folder",
+    "models": ["dragon"],
+    "full": [[]],
+    "quick": [["--rays", "2000"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 PLACES = ("as it lies", "scaled by 1e-3", "scaled by 1e3", "moved 100 diagonals")
 
 

@@ -31,6 +31,15 @@ from striptools.trace import Tracer
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import HierarchyKind
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dragon", "dragon_3m5", "dem_jacksboro", "powerplant"],
+    "full": [[]],
+    "quick": [["--repeats", "1"]],
+    "needs": ["embreex"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 PIXELS = 1024
 TILE = 8
 FAR = np.float32(1e37)
