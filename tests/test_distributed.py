@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -108,7 +109,7 @@ def test_two_processes_find_the_hits_of_one(
     np.savez(tmp_path / "rays.npz", **rays)  # pyright: ignore[reportArgumentType]
     two_processes(tmp_path)
     tracer = Tracer(scene, device="cpu")
-    wanted = tracer.closest_hit(**rays, counters=True)
+    wanted = tracer.closest_hit(rays["origins"], rays["directions"], t_max=rays["t_max"], counters=True)
     assert wanted.counters is not None
     assert 500 < wanted.hit.sum() < len(wanted.t) - 500
     for process in range(2):
@@ -123,7 +124,7 @@ def test_two_processes_find_the_hits_of_one(
 def test_shares_are_even_and_leave_nothing_out(count: int, processes: int) -> None:
     ends = [distributed.share_of(count, process, processes) for process in range(processes)]
     assert [ends[0].start, ends[-1].stop] == [0, count]
-    assert all(one.stop == other.start for one, other in zip(ends, ends[1:], strict=False))
+    assert all(one.stop == other.start for one, other in pairwise(ends))
     sizes = [end.stop - end.start for end in ends]
     assert max(sizes) - min(sizes) <= 1
 

@@ -81,8 +81,8 @@ def any_hit(
 
 def _share(origins: np.ndarray, given: dict[str, Any]) -> tuple[slice, dict[str, Any]]:
     mine = share_of(len(origins))
-    t_max = given.get("t_max")
-    return mine, given if np.ndim(t_max) == 0 else given | {"t_max": np.asarray(t_max)[mine]}
+    t_max = np.asarray(given.get("t_max"))
+    return mine, given | {"t_max": t_max[mine]} if t_max.ndim else given
 
 
 def gather_hits(hits: Hits) -> Hits:

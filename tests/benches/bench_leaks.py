@@ -138,7 +138,7 @@ class Table:
 
 def main() -> int:
     """Measure each closed model, print its table, and fail where one of ours leaks."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).split("\n")[0])
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("--quick", action="store_true", help="24,000 rays of each kind in three places")
     parser.add_argument("--full", action="store_true", help="every walk with every ray in every place")
