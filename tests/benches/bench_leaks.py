@@ -3,16 +3,15 @@
     python tests/benches/bench_leaks.py [MODEL ...] [--quick | --full] [--record]
 
 MODEL is a mesh or a folder of meshes; those that are not closed are named and left out. Four closed shapes
-that need no file come first. Each model stands in fifteen places: scaled by 1e-6 to 1e6, and moved by 0, 1
+that need no file come last. Each model stands in fifteen places: scaled by 1e-6 to 1e6, and moved by 0, 1
 and 1000 of its diagonals, rounded to float32 and cleaned anew; whether it is closed is looked at in each
 place. In each, half of the rays come from outside and half from inside, half go to edges and half to
 vertices, and a quarter run along an axis: 2 million at edges and 2 million at vertices for each model. See
 `leak_rays`.
 
 Every ray goes through the walks that a user gets (`leak_walks.MAIN`): closest hits one by one and in packets,
-any hits the same two ways with t_max just beyond the target. Models of at most `SMALL` triangles go through
-all other walks with every ray at every place; of larger ones each other walk takes three of the places, so
-that all scales and offsets are met by some (`--full`: all). Shared instances take an eighth of the rays in
+any hits the same two ways with t_max just beyond the target. Each other walk takes three of the places with
+all their rays, so that every place is met by some (`--full`: all places, twice the time). Shared instances take an eighth of the rays in
 every place, turned, stretched and mirrored besides; there certain is what is so of the ray as it was moved.
 
 A leak is a certain ray that is reported to miss, or to hit farther than the target by more than the bound.
@@ -53,9 +52,8 @@ from striptools.trace.leaves import lay_out
 SCALES = (1.0, 1e-6, 1e-3, 1e3, 1e6)
 OFFSETS = (0.0, 1.0, 1e3)
 PLACES = tuple(Place(scale, offset) for offset in OFFSETS for scale in SCALES)
-SMALL = 50_000
 TURNS = 5
-"""Of so many places a large model goes through each other walk in one."""
+"""Of so many places each other walk takes one."""
 
 SHARED_PART = 8
 KINDS = ("edges", "vertices")
@@ -142,12 +140,12 @@ def main() -> int:
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("--quick", action="store_true", help="24,000 rays of each kind in three places")
     parser.add_argument("--full", action="store_true", help="every walk with every ray in every place")
-    parser.add_argument("--no-shapes", action="store_true", help="only the models")
+    parser.add_argument("--no-shapes", dest="shapes", action="store_false", help="only the models")
     parser.add_argument("--record", action="store_true")
     arguments = parser.parse_args()
     amount = QUICK if arguments.quick else Amount(every_walk=arguments.full)
     failed = 0
-    for name, mesh in closed_models(arguments.models, {} if arguments.no_shapes else closed_shapes()):
+    for name, mesh in closed_models(arguments.models, closed_shapes() if arguments.shapes else {}):
         begun = time.process_time()
         table = measure(mesh, amount)
         rows = rows_of(name, mesh, table, amount)
@@ -164,8 +162,7 @@ def ours(table: Table) -> list[Count]:
 
 
 def closed_models(paths: list[Path], shapes: dict[str, Mesh]) -> Iterator[tuple[str, Mesh]]:
-    """The shapes, then each closed mesh of the paths and folders, as float32."""
-    yield from shapes.items()
+    """Each closed mesh of the paths and folders, as float32, then the shapes."""
     files = [file for path in paths for file in (sorted(path.glob("*.ply")) if path.is_dir() else [path])]
     for file in files:
         mesh = load_mesh(file).flattened()
@@ -174,6 +171,7 @@ def closed_models(paths: list[Path], shapes: dict[str, Mesh]) -> Iterator[tuple[
             yield file.stem, mesh
         else:
             sys.stdout.write(f"{file.stem} is not closed\n")
+    yield from shapes.items()
 
 
 def measure(mesh: Mesh, amount: Amount) -> Table:
