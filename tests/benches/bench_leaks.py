@@ -11,8 +11,9 @@ vertices, and a quarter run along an axis: 2 million at edges and 2 million at v
 
 Every ray goes through the walks that a user gets (`leak_walks.MAIN`): closest hits one by one and in packets,
 any hits the same two ways with t_max just beyond the target. Each other walk takes three of the places with
-all their rays, so that every place is met by some (`--full`: all places, twice the time). Shared instances take an eighth of the rays in
-every place, turned, stretched and mirrored besides; there certain is what is so of the ray as it was moved.
+all their rays, so that every place is met by some (`--full`: all places, twice the time). Shared instances
+take an eighth of the rays in every place, turned, stretched and mirrored besides; there certain is what is so
+of the ray as it was moved.
 
 A leak is a certain ray that is reported to miss, or to hit farther than the target by more than the bound.
 Hits of every walk are compared with those of the first bit for bit too, and those of the first judged.
@@ -70,7 +71,7 @@ class Amount:
     every_walk: bool = False
 
 
-QUICK = Amount(24_000, (Place(), Place(1e-6, 1e3), Place(1e6, 1.0)))
+QUICK = Amount(24_000, (Place(), Place(1e-6, 1e3), Place(1e6, 1.0)), every_walk=True)
 
 
 @dataclass
@@ -187,10 +188,7 @@ def measure(mesh: Mesh, amount: Amount) -> Table:
         table.inside += len(target.inside) > 0
         batches = batches_of(target, runs, np.random.default_rng(turn))
         table.packed += packed_share(scene, batches) / len(amount.places)
-        walks = (
-            OTHERS if amount.every_walk or mesh.triangle_count <= SMALL
-            else [walk for k, walk in enumerate(OTHERS) if (k + turn) % TURNS == 0]
-        )  # fmt: skip
+        walks = [walk for k, walk in enumerate(OTHERS) if amount.every_walk or (k + turn) % TURNS == 0]
         trace_all(table, spot, scene, target, batches, (*MAIN, *walks))
         trace_shared(table, spot, mesh, scene.remap.face, runs // SHARED_PART or 1, turn)
         trace_peers(table, spot, target, batches)
