@@ -54,7 +54,7 @@ SCALES = (1.0, 1e-6, 1e-3, 1e3, 1e6)
 OFFSETS = (0.0, 1.0, 1e3)
 PLACES = tuple(Place(scale, offset) for offset in OFFSETS for scale in SCALES)
 TURNS = 5
-"""Of so many places each other walk takes one."""
+"""Of so many places each other walk takes one: at each offset another scale."""
 
 SHARED_PART = 8
 KINDS = ("edges", "vertices")
@@ -188,7 +188,7 @@ def measure(mesh: Mesh, amount: Amount) -> Table:
         table.inside += len(target.inside) > 0
         batches = batches_of(target, runs, np.random.default_rng(turn))
         table.packed += packed_share(scene, batches) / len(amount.places)
-        walks = [walk for k, walk in enumerate(OTHERS) if amount.every_walk or (k + turn) % TURNS == 0]
+        walks = [walk for k, walk in enumerate(OTHERS) if amount.every_walk or (k + turn + turn // TURNS) % TURNS == 0]
         trace_all(table, spot, scene, target, batches, (*MAIN, *walks))
         trace_shared(table, spot, mesh, scene.remap.face, runs // SHARED_PART or 1, turn)
         trace_peers(table, spot, target, batches)
