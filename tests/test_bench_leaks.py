@@ -174,14 +174,34 @@ def test_shared_instances_do_not_leak(turn: int) -> None:
     assert not table.told
 
 
-def test_the_rows_say_what_was_traced(capsys: pytest.CaptureFixture[str]) -> None:
-    mesh = Mesh(*sphere(2))
+def test_the_rows_say_what_was_traced(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, others = Mesh(*sphere(2)), leak_walks.OTHERS[:2]
+    monkeypatch.setattr(bench, "OTHERS", others)
     amount = bench.Amount(RUNS * RUN * 2, (Place(),), every_walk=True)
     table = bench.measure(mesh, amount)
     rows = bench.rows_of("ball", mesh, table, amount)
     walks = [row for row in rows if row.metric.startswith("leaks, ")]
-    assert len(walks) == len(leak_walks.MAIN) + len(leak_walks.OTHERS) + len(leak_walks.SHARED)
+    assert len(walks) == len(leak_walks.MAIN) + len(others) + len(leak_walks.SHARED)
     assert all(row.value == 0 for row in rows if not row.peer and row.unit == "rays")
     assert f"{2 * RUNS * RUN} rays at edges" in walks[0].note
     bench.say(rows, table, 1.0)
     assert "leaks, compressed: 0" in capsys.readouterr().out
+
+
+def test_each_other_walk_meets_every_offset_at_another_scale(monkeypatch: pytest.MonkeyPatch) -> None:
+    met: dict[str, list[Place]] = {}
+
+    def note(_: object, spot: Place, *given: object) -> None:
+        for walk in given[-1]:  # pyright: ignore[reportGeneralTypeIssues]
+            met.setdefault(walk.name, []).append(spot)
+
+    monkeypatch.setattr(bench, "trace_all", note)
+    monkeypatch.setattr(bench, "trace_shared", lambda *_: None)
+    monkeypatch.setattr(bench, "trace_peers", lambda *_: None)
+    bench.measure(Mesh(*tetrahedron()), bench.Amount(2 * RUN * 15))
+    for walk in leak_walks.OTHERS:
+        assert {spot.offset for spot in met[walk.name]} == set(bench.OFFSETS)
+        assert len({spot.scale for spot in met[walk.name]}) == 3
+    assert all(len(met[walk.name]) == 15 for walk in leak_walks.MAIN)

@@ -188,7 +188,11 @@ def measure(mesh: Mesh, amount: Amount) -> Table:
         table.inside += len(target.inside) > 0
         batches = batches_of(target, runs, np.random.default_rng(turn))
         table.packed += packed_share(scene, batches) / len(amount.places)
-        walks = [walk for k, walk in enumerate(OTHERS) if amount.every_walk or (k + turn + turn // TURNS) % TURNS == 0]
+        walks = [
+            walk
+            for k, walk in enumerate(OTHERS)
+            if amount.every_walk or (k + turn + turn // TURNS) % TURNS == 0
+        ]
         trace_all(table, spot, scene, target, batches, (*MAIN, *walks))
         trace_shared(table, spot, mesh, scene.remap.face, runs // SHARED_PART or 1, turn)
         trace_peers(table, spot, target, batches)
