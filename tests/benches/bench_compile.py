@@ -4,10 +4,10 @@
 
 Every function is called in a pair of processes of its own, with few rays of a small scene. What JAX says of
 tracing, lowering and XLA's compiling is summed over all programs of the call; the program that XLA takes
-longest for is told apart, and in processor time too, which other programs on the machine leave alone. Least of
-the runs. A call in packets needs two programs: rays that find no company walk alone. What Numba compiles is
-kept in its own cache and is not counted. Ends with 1 where XLA takes more than `LIMIT` seconds of the processor
-for one program, or where a second process compiles what the first one kept.
+longest for is told apart, and in processor time too, which other programs on the machine leave alone. Least
+of the runs. A call in packets needs two programs: rays that find no company walk alone. What Numba compiles
+is kept in its own cache and is not counted. Ends with 1 where XLA takes more than `LIMIT` seconds of the
+processor for one program, or where a second process compiles what the first one kept.
 """
 
 import argparse
