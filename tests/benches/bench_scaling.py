@@ -5,8 +5,8 @@
 One core is all threads of the process pinned to the first core and one device; two cores are two devices and
 no pins. One device beside a free core is measured too: the tracer's host kernels then have that core. Other
 programs may run on the machine, so a time counts only where a loop that does nothing but compute ran on two
-threads in the least time of one, right before and right after (`QUIET`); what is compared are least times.
-`--everything` counts all. Linux only.
+threads in the least time of one, right before and right after (`QUIET`), and is taken only once nothing else
+has run for a moment; what is compared are least times. `--everything` counts all. Linux only.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +29,9 @@ from striptools.trace.rays import Camera, camera_rays, cosine_rays
 
 QUIET = 1.1
 """Time of the loop on two threads, over its least time on one, up to which the machine is taken for quiet."""
+
+CALM = 5
+"""Looks in a row at which no other thread of the machine runs before a time is taken."""
 
 SPINS = 100
 ENOUGH = 25
@@ -106,27 +110,39 @@ def by_turns(one: Call, two: Call, seconds: float, quiet: float) -> tuple[float,
     two()
     alone = min(timed(spin) for _ in range(30))
     end, turn = time.perf_counter() + seconds, 0
-    before = np.inf
     while time.perf_counter() < end and min(map(len, times)) < ENOUGH:
+        await_quiet(end if quiet < np.inf else 0.0)
         call, cores = ways[turn % len(ways)]
         alone = min(alone, timed(spin))
-        before = min(before, together()) / alone
+        before = together() / alone
         pin(cores)
         spent = timed(call)
         pin({0, 1})
         after = together()
         if max(before, after / alone) <= quiet:
             times[turn % len(ways)].append(spent)
-        before = after
         turn += 1
     pinned, beside, both = (min(each, default=np.inf) for each in times)
     return pinned, beside, both, min(map(len, times))
 
 
+def await_quiet(end: float) -> None:
+    """Sleep until nothing else has run for a moment, or until that time."""
+    seen = 0
+    while seen < CALM and time.perf_counter() < end:
+        running = next(
+            line for line in Path("/proc/stat").read_text().splitlines() if "procs_running" in line
+        )
+        seen = seen + 1 if int(running.split()[1]) <= 1 else 0
+        time.sleep(0.004)
+
+
 def pin(cores: set[int]) -> None:
     """Let every thread of this process run on these cores only."""
     for thread in os.listdir("/proc/self/task"):
-        os.sched_setaffinity(int(thread), cores)
+        # It may have ended meanwhile.
+        with suppress(ProcessLookupError):
+            os.sched_setaffinity(int(thread), cores)
 
 
 def together() -> float:
