@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from leak_rays import RUN, Place, Rays, Target, Verdict, from_inside, from_outside, judge
 from leak_shapes import closed_shapes
-from leak_walks import MAIN, OTHERS, SHARED, Walk, peers
+from leak_walks import MAIN, OTHERS, SHARED, Traces, Walk, peers
 from results import Row, append
 
 import striptools
@@ -229,7 +229,7 @@ def trace_all(
 
 
 def trace_batch(
-    table: Table, spot: Place, walk: str, tracer: Tracer, batch: Batch, wanted: Hits, *, packets: bool
+    table: Table, spot: Place, walk: str, tracer: Traces, batch: Batch, wanted: Hits, *, packets: bool
 ) -> None:
     """Trace a batch by one walk, closest hits and any hits."""
     rays, verdict = (batch.rays.origins, batch.rays.directions), batch.verdict

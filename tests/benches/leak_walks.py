@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,7 +12,39 @@ from striptools.hierarchies.loose_octree import build_sah_bvh
 from striptools.hierarchies.options import OVER, HierarchyOptions
 from striptools.partition.boxes import range_boxes
 from striptools.reducem.scene import Scene
-from striptools.trace import Tracer
+from striptools.trace import Hits, Tracer
+
+
+class Traces(Protocol):
+    """What a walk is asked."""
+
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, packets: bool = True) -> Hits:
+        """As of `Tracer`."""
+        ...
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray, packets: bool = True
+    ) -> np.ndarray:
+        """As of `Tracer`."""
+        ...
+
+
+class Gathering:
+    """The walk that gathers all hits: the first of them is the closest, and where some are counted is one."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self.tracer = tracer
+
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, packets: bool = False) -> Hits:
+        """The first of all hits."""
+        found = self.tracer.all_hits(origins, directions, k=1)
+        return Hits(found.t[:, 0], found.face[:, 0], found.u[:, 0], found.v[:, 0], found.triangle[:, 0])
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray, packets: bool = False
+    ) -> np.ndarray:
+        """Whether hits are counted."""
+        return self.tracer.count_hits(origins, directions, t_max=t_max) > 0
 
 
 @dataclass(frozen=True)
@@ -26,7 +58,7 @@ class Walk:
     """
 
     name: str
-    tracer: Callable[[Scene], Tracer]
+    tracer: Callable[[Scene], Traces]
     packets: bool = False
 
 
@@ -59,6 +91,8 @@ OTHERS = (
     ),
     Walk("presorted, no nodes", _under(HierarchyOptions("presorted", levels=0))),
     Walk("presorted, 10 levels", _under(HierarchyOptions("presorted", levels=10))),
+    Walk("all hits, expanded", lambda scene: Gathering(Tracer(scene, device="cpu", resident="expanded"))),
+    Walk("all hits, compressed", lambda scene: Gathering(Tracer(scene, device="cpu", resident="compressed"))),
 )
 
 SHARED = ("expanded", "compressed")
