@@ -175,6 +175,14 @@ def scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, 
     stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
     for axis in range(3):
         mode, width, anchor, exponent = axis_of(headers, block, axis)
+        if mode == 0 and exponent + scale_exponent >= -126:
+            # Integers of at most 24 bits and a normal power of two: float32 is exact.
+            power = np.int32((exponent + scale_exponent + 127) << 23).view(np.float32)
+            for j in range(3):
+                whole = take(words, begin + indices[j] * stride, width) + anchor
+                corners[j, axis] = np.float32(whole) * power
+            begin += width
+            continue
         unit = power_of_two(exponent + scale_exponent)
         for j in range(3):
             number = take(words, begin + indices[j] * stride, width)
@@ -239,6 +247,7 @@ def weigh_packed_hits(
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
     held = 0
+    last, turn = np.int64(-1), np.int64(0)
     for k in range(len(at)):
         r = at[k]
         if r >= 0:
@@ -254,12 +263,13 @@ def weigh_packed_hits(
                 u[r] = 0.0
                 v[r] = 0.0
             elif weighed:
-                # Decode the triangle, and turn it as the tests do.
-                bit = np.int64(headers[block, 1]) << 5
-                counts = block_counts(headers, block)
-                indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
-                scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
-                turn = first_corner(decoded)
+                # Decode the triangle, unless it was hit just before, and turn it as the tests do.
+                if number != last:
+                    bit = np.int64(headers[block, 1]) << 5
+                    counts = block_counts(headers, block)
+                    indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
+                    scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
+                    last, turn = number, np.int64(first_corner(decoded))
                 axes = take_ray(origins, directions, r, room, held)
                 for axis in range(3):
                     for j in range(3):
