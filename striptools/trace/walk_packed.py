@@ -517,7 +517,7 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # place of two, fewer words of a record read, hits weighed in two passes of 64. Three words a vertex in the
 # place of the four that the widest blocks need would give 1.02.
 #
-# In packets: 0.48-0.50 of expanded packets when they came, then the run found once 0.56, the header too 0.585,
+# In packets: 0.48-0.50 of expanded packets when they came, the run found once 0.56, the header too 0.585,
 # a node's grid read once an axis 0.60, leaves that no ray of the packet meets left unread 0.62 (of the
 # dragon's 18 leaves a packet one in five). Bunny 0.49 to 0.54. One by one the run found once is 1.00 to 1.02,
 # the header too 0.97: there latency counts, and what is kept goes through memory.
@@ -527,7 +527,7 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # is often the faster. Of what was tried in packets / one by one against the run and header found once, lost:
 # corner indices kept by a division by ones 0.97-1.03 / 0.95; their bits shifted into rows of a small array
 # 0.86 / 0.78; three corners as 24 lanes 0.90 / 0.70, ten vertices as 16 lanes with far corners gathered 0.92,
-# all as one (3, 3, 8) array behind two conds 0.87 / 0.56; coordinates cut straight out of the four words 0.98,
+# all as one (3, 3, 8) array behind two conds 0.87 / 0.56; coordinates cut straight from the four words 0.98,
 # modes blended by masks 0.99. A cache of 64 to 4096 leaves decoded lately, filled in a loop of one turn: 0.55
 # to 1.0 in packets (nearly half of the visits miss in 1024 leaves) and 0.90 one by one: looking is as dear as
 # decoding.
