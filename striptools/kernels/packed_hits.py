@@ -5,7 +5,7 @@ import numpy as np
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
-from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, give_weights, take_ray, weigh_chunk
+from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner
 
 
@@ -281,7 +281,5 @@ def weigh_packed_hits(
                 turn_of[held] = (turn + rotations[number]) % 3 if len(rotations) > 0 else turn
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
-            weigh_chunk(room, scale)
-            for i in range(held):
-                give_weights(room, i, turn_of[i], ray_of[i], u, v)
+            weigh_held(room, held, scale, ray_of, turn_of, u, v)
             held = 0

@@ -87,6 +87,14 @@ def give_weights(room, i, turn, r, u, v):
     v[r] = room[WEIGHTS + (2 - turn) * CHUNK + i]
 
 
+@inlined
+def weigh_held(room, held, scale, ray_of, turn_of, u, v):
+    """Write u and v of the first `held` places of a chunk, of these rays and turns."""
+    weigh_chunk(room, scale)
+    for i in range(held):
+        give_weights(room, i, turn_of[i], ray_of[i], u, v)
+
+
 @kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
@@ -136,7 +144,5 @@ def weigh_hits(
                 turn_of[held] = slot & 3
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
-            weigh_chunk(room, scale)
-            for i in range(held):
-                give_weights(room, i, turn_of[i], ray_of[i], u, v)
+            weigh_held(room, held, scale, ray_of, turn_of, u, v)
             held = 0
