@@ -36,7 +36,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import index
+from striptools.trace.numerics import any_lane, index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
@@ -46,6 +46,7 @@ from striptools.trace.walk import (
     Leaf,
     Traced,
     WalkOptions,
+    found_any,
     replaced,
     walk_rays,
 )
@@ -218,8 +219,10 @@ class PackedScene(NamedTuple):
 
         leaf = decoded()
         t = leaf.crossings(shear, test=options.test, again=decoded)
-        found = _any((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, leaf.name, options.any_hit), lambda: best)
+        if options.any_hit:
+            return found_any(best, t)
+        found = any_lane((t > 0) & (t <= best.t))
+        return lax.cond(found, lambda: self._merged(best, t, leaf.name), lambda: best)
 
     def triangles_of(self, child: Array) -> Array:
         """() int32: how many triangles a run has."""
@@ -234,14 +237,12 @@ class PackedScene(NamedTuple):
         """Walk r rays made ready."""
         return walk_rays(self, ready, options)
 
-    def _merged(self, best: Best, t: Array, name: Array, any_hit: bool) -> Best:
+    def _merged(self, best: Best, t: Array, name: Array) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
         tied = (t > 0) & (t == best.t)
-        if any_hit:
-            tied = jnp.zeros_like(tied)
-        elif self.has_faces:
+        if self.has_faces:
             mine, others = (lambda: self.faces_of(name)), (lambda: self.faces_of(best.name))
-            tied = lax.cond(_any(tied), lambda: tied & (mine() < others()), lambda: tied)
+            tied = lax.cond(any_lane(tied), lambda: tied & (mine() < others()), lambda: tied)
         else:
             tied = tied & (name < best.name)
         return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
@@ -468,11 +469,6 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
 
     last = jnp.where(before(1, 0), before(2, 1), before(2, 0))
     return jnp.where(last, 2, jnp.where(before(1, 0), 1, 0))
-
-
-def _any(flags: Array) -> Array:
-    """Whether any lane's flag is set."""
-    return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
 
 
 def _number(a: Array) -> Array:
