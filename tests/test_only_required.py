@@ -409,6 +409,14 @@ def test_a_program_gives_what_is_asked(name, resident):
     assert ("in_range" in functions(text)) is (name != "any hit")
 
 
+@pytest.mark.parametrize("any_hit", [True, False])
+def test_names_are_read_where_they_are_told(any_hit):
+    expanded = functions(text_of(small_scene(), any_hit=any_hit))
+    assert ("faces_in" in expanded) is not any_hit
+    for found in (expanded, functions(text_of(small_scene(), resident="compressed", any_hit=any_hit))):
+        assert ("closest_name" in found) is not any_hit
+
+
 @pytest.mark.parametrize(
     ("remap", "any_hit", "there"), [(True, False, True), (True, True, False), (False, False, False)]
 )
@@ -483,7 +491,15 @@ assert "jax.experimental.pallas" in sys.modules
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"resident": "compressed"}, {"instances": "shared"}, {"counters": 1}]
+    "options",
+    [
+        {},
+        {"resident": "compressed"},
+        {"instances": "shared"},
+        {"counters": 1},
+        {"test": "fast"},
+        {"test": "float64"},
+    ],
 )
 def test_hits_without_weights_are_the_same_hits(options, monkeypatch):
     options = dict(options)
