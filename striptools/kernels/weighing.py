@@ -110,7 +110,7 @@ def weigh_hits(
         place: (f,) int32, see `fill_leaf_blocks`.
         blocks: (l, 10, 8) float32, see `fill_leaf_blocks`.
         scale: float32, what positions in `blocks` were multiplied by.
-        triangle_of: (f,) int32, the triangle in file order of each face.
+        triangle_of: (f,) int32, the triangle in file order of each face; (0,) where faces are triangles.
         t: (r,) float32, written.
         face: (r,) int32, written.
         u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
@@ -128,7 +128,7 @@ def weigh_hits(
             t[r] = found_t[k]
             name = found_face[k]
             face[r] = name
-            triangle[r] = triangle_of[name] if name >= 0 else -1
+            triangle[r] = triangle_of[name] if name >= 0 and len(triangle_of) > 0 else max(name, -1)
             if weighed and name < 0:
                 u[r] = 0.0
                 v[r] = 0.0
