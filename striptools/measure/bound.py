@@ -49,7 +49,8 @@ with multiplications by a reciprocal instead of divisions, fused or not.
    = 1 / |n m| = sqrt(|grad z|^2 + (1 + S grad z)^2), and |d| |t - t_exact| <= D |m| / |n m| = D / |cos|,
    where there is no rounding. The last rounding terms are those of the sum itself (a_z, 1/d_z, three
    products, four sums, reciprocal, product). The bound of t is that over |d_z|, plus 2^-122 / det_low for
-   products that underflow.
+   products that underflow, which no convexity bounds: of an orientation that is not certain 2^-122 / |det|,
+   since where products underflow no rounding of larger numbers hides det.
 7. u and v come from the same weights. Weights of one sign make sum U_i p_i / det a point of the moved face,
    within stray = sum rho_i (|p_i| + delta_v) / det_low of the ray; u and v have four more roundings. So the
    point (1-u-v) v0 + u v1 + v v2 of the source's corners lies within delta_v + min(stray, max |p_i|) +
@@ -280,7 +281,7 @@ def _judge_signed(seen: _Seen, signs: "_PlaneView", weights: "_PlaneView", last:
     rounding = gamma(12, weights.unit) * seen.largest
     z_hit, z_bound = weights.depth_and_bound(rounding, seen.shear, seen.error_bound)
     depth = np.abs(seen.depth)
-    t_bound = z_bound / depth + np.where(weights.det_low > 0, FLUSHED / weights.det_low, 0.0)
+    t_bound = z_bound / depth + weights.underflow()
     t = z_hit / seen.depth
     t_bound = t_bound + last * (np.abs(t) + t_bound)
     t_bound = np.where(np.isnan(t_bound), np.inf, t_bound)
@@ -425,6 +426,11 @@ class _PlaneView:
         rounding = (self.rho * (self.r + self.delta_v)).sum(axis=0) / self.det_low
         farthest = self.r.max(axis=0)
         return self.delta_v + np.where(self.det_low > 0, np.minimum(rounding, farthest), farthest)
+
+    def underflow(self) -> np.ndarray:
+        """What products that underflow may add to an error of t."""
+        det = np.where(self.det_low > 0, self.det_low, np.abs(self.det))
+        return np.where(det > 0, FLUSHED / det, 0.0)
 
     def acceptable(self) -> np.ndarray:
         reach = BEYOND_FACE * self.delta_v
