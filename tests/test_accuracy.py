@@ -166,14 +166,26 @@ def kept(report: VerifyReport, test: TriangleTest) -> None:
 
 
 ONE_FAR_CORNER = Mesh(
-    np.float32([[2.6417978, 1.5592732, -0.80288386], [-1.0258759, -1.7388544, -1.0853097], [0.17, 3e38, 1.46]]),
+    np.float32([[2.6417978, 1.5592732, -0.80288386], [-1.02588, -1.73885, -1.08531], [0.17, 3e38, 1.46]]),
     np.array([[2, 1, 0]], np.int32),
 )
 """What its coordinates are in parts of the largest one underflows."""
 
+THINNER_THAN_FLOAT64_TELLS = Mesh(
+    np.float32(
+        [
+            *([1e4, 1e4, 1e4], [1e4, 1e4, 10001], [10001, 1e4, 10000.5]),
+            *([1e-8, 2e-8, -3e-8], [2e-8, 4e-8, -6e-8], [3e-8, 6e-8, -9e-8]),
+        ]
+    ),
+    np.array([[0, 1, 2], [3, 4, 5]], np.int32),
+)
+"""The second face is a line but for the rounding of its corners."""
+
 
 @given(clean_meshes(), st.integers(0, 99))
 @example(ONE_FAR_CORNER, 0)
+@example(THINNER_THAN_FLOAT64_TELLS, 0)
 @limits(max_examples=12, deadline=None)
 def test_t_is_within_the_bound_of_integers(mesh: Mesh, seed: int) -> None:
     origins, directions = aimed_rays(mesh.positions, mesh.faces, 24, seed)

@@ -102,7 +102,7 @@ def try_one(corners, ids, turns, o, d, t_max=np.inf, *, all_signs=False):
 def near(corners, o, d, t, reach=0.0):
     """Whether the point at t is in a triangle's box, but for half of what the tracer widens boxes by.
 
-    The weights of a triangle no larger than the rounding of its distance, of a sliver seen obliquely or of one
+    The weights of a triangle no larger than its distance is rounded by, of a sliver seen obliquely, or of one
     whose products underflow are wrong, and so is its t: see `measure.bound`, term 9. Only its box tells.
     """
     margin = 2.0**-22 * max(np.abs(corners).max(), np.abs(o).max(), reach)

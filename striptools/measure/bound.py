@@ -314,7 +314,9 @@ def _judge_fast(seen: _Seen) -> Pairs:
     low = np.min([turn.low for turn in turns], axis=0)
     t = plane.depth_and_bound(seen.largest, seen.shear, seen.error_bound)[0] / seen.depth
     t_bound = np.max([turn.t_bound + np.abs(t - turn.t) for turn in turns], axis=0)
-    t_bound = np.where(low > 0, t_bound, np.inf)
+    # Corners seen in float64 are rounded too: a face thinner than that has no plane whose t could be told.
+    told = np.abs(plane.det) > EDGE_ON * seen.largest * plane.edge.max(axis=0)
+    t_bound = np.where((low > 0) & told, t_bound, np.inf)
     accepted = np.any([turn.accepted for turn in turns], axis=0) | ~(low > 0)
     outside = np.sum([np.maximum(-plane.weight(corner), 0.0) for corner in range(3)], axis=0)
     outside += (plane.swing + plane.rho).sum(axis=0) / plane.det_low
