@@ -56,6 +56,10 @@ class Tracer:
     range, 2**-126 or the largest number. Origins beyond 2**40 times the largest coordinate of the scene get
     some finite answer. Everything else is within the bound of `measure.bound`.
 
+    Hits are the same whatever the hierarchy, residency or packets, bit for bit, but where rounding puts a hit
+    outside its triangle's own box: on slivers seen obliquely, and on triangles so small, 2**-49 of the scene,
+    that products underflow. There another path may miss it (`measure.bound`, term 9).
+
     Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
