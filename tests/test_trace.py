@@ -128,6 +128,26 @@ def excused(scene, hits, other_scene, other_hits, origins, directions):
     return np.where(closer, first, beyond_box(other_scene, other_hits, origins, directions))
 
 
+def assert_equal_hits(fields, paths, origins, directions):
+    """Fields of two paths' hits, pairs of scene and hits, are the same for all rays but those `excused`."""
+    (scene, hits), (other_scene, other_hits) = paths
+    pairs = [(getattr(hits, field), getattr(other_hits, field)) for field in fields]
+    differ = np.any([~((a == b) | (a != a) & (b != b)) for a, b in pairs], axis=0)
+    if differ.any():
+        differ &= ~excused(scene, hits, other_scene, other_hits, origins, directions)
+    assert not differ.any(), np.flatnonzero(differ)
+
+
+def test_hits_that_are_not_excused_must_be_equal():
+    scene = scene_of(Mesh(*sphere(3)))
+    origins, directions = rays_at(scene, 60, 2)
+    hits = Tracer(scene, device="cpu", threads=1).closest_hit(origins, directions)
+    assert_equal_hits(("t", "face"), ((scene, hits), (scene, hits)), origins, directions)
+    farther = replace(hits, t=np.where(hits.hit, np.nextafter(hits.t, np.float32(np.inf)), hits.t))
+    with pytest.raises(AssertionError):
+        assert_equal_hits(("t", "face"), ((scene, hits), (scene, farther)), origins, directions)
+
+
 def far_fetched(scene, hits, origins, directions, expected=None):
     """Hits `beyond_box`, or of `faint` triangles, which the tracer may find or not."""
     faces = [hits.face] if expected is None else [hits.face, expected[1]]
