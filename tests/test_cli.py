@@ -353,6 +353,8 @@ def test_every_end_is_one_line(
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_in_order(tmp_path: Path, sent: signal.Signals, code: int) -> None:
     command = [*COMMAND, "convert", "-", str(tmp_path / "a.rdm"), "--from", "ply"]
+    # A shell ignores SIGINT for what it runs in the background, and a child would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:

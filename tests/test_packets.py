@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from rays import rays_at
 from strategies import book, clean_meshes, cube, fan, grid, soup, sphere, stack, tangle
 from test_hoisting import assert_hoisted
+from test_trace import assert_equal_hits
 
 import striptools
 from striptools.errors import StriptoolsError
@@ -78,9 +79,8 @@ def assert_same(scene, rays, resident):
     tracer = Tracer(scene, device="cpu", threads=1, resident=resident)
     alone = tracer.closest_hit(origins, directions, t_max=t_max, packets=False)
     together = tracer.closest_hit(origins, directions, t_max=t_max)
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(together, field), getattr(alone, field), err_msg=field)
-    np.testing.assert_array_equal(tracer.any_hit(origins, directions, t_max=t_max), alone.hit)
+    assert_equal_hits(FIELDS, ((scene, alone), (scene, together)), origins, directions)
+    np.testing.assert_array_equal(tracer.any_hit(origins, directions, t_max=t_max), together.hit)
     return alone
 
 

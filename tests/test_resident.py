@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rays import axial_rays, far_rays, rays_at, rays_from_inside
 from shapes import SHAPES, THIN, UNITS, moved_sphere
 from strategies import clean_meshes, cube, grid, soup, sphere
+from test_trace import assert_equal_hits
 
 import striptools
 from striptools.errors import UsageError
@@ -45,8 +46,7 @@ def assert_same(scene, origins, directions, t_max=None):
     expanded, compressed = both(scene)
     one = expanded.closest_hit(origins, directions, t_max=t_max)
     two = compressed.closest_hit(origins, directions, t_max=t_max)
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(one, field), getattr(two, field), err_msg=field)
+    assert_equal_hits(FIELDS, ((scene, one), (scene, two)), origins, directions)
     np.testing.assert_array_equal(compressed.any_hit(origins, directions, t_max=t_max), two.hit)
     return two
 

@@ -1,17 +1,28 @@
 """Simplification: the share, the distance both ways against brute force, errors kept or refused."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from striptools.errors import UsageError
+from striptools.measure.strays import Strays, own_source, strays_of
+from striptools.measure.verify import VerifyOptions, verify
+from striptools.mesh.attributes import Attribute
+from striptools.mesh.io import save_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.simplify import SimplifyOptions, simplify
 from striptools.mesh.surface_distance import Surface, deviation
-from striptools.pipeline import Options, convert_with_report
+from striptools.pipeline import Options, convert, convert_with_report
+from striptools.reducem.quantize import PrecisionOptions
 
 pytest.importorskip("fast_simplification")
+
+Run = Callable[..., tuple[int, str, str]]
 
 
 def wavy(side: int = 24, height: float = 0.1) -> Mesh:
@@ -123,3 +134,144 @@ def test_a_conversion_says_what_it_simplified() -> None:
     assert report.simplified is not None
     assert scene.triangle_count == report.simplified.mesh.triangle_count
     assert scene.metadata["simplified"] == report.simplified.to_dict()
+
+
+FEW = VerifyOptions(rays=32, aimed_rays=512)
+WAYS = {
+    "plain": Options(),
+    "without a remap": Options(remap=False),
+    "on a grid": Options(precision=PrecisionOptions(10)),
+    "within an error": Options(simplify=SimplifyOptions(largest_error=2e-3)),
+}
+
+
+def source_mesh(way: str) -> Mesh:
+    """A mesh that cleaning changes: two faces without an area, normals; far away in float64 where asked."""
+    mesh = wavy()
+    faces = np.concatenate([np.zeros((2, 3), np.int32), mesh.faces])
+    normals = Attribute("normal", "vertex", np.ones((mesh.vertex_count, 3), np.float32))
+    positions = mesh.positions.astype(np.float64) / 3 + 1e7 if way == "far away" else mesh.positions
+    return Mesh(positions, faces, attributes=(normals,))
+
+
+def simplified(way: str) -> tuple[Mesh, Options]:
+    options = WAYS.get(way, Options())
+    if not options.simplify.asked:
+        options = replace(options, simplify=SimplifyOptions(keep=0.2))
+    return source_mesh(way), options
+
+
+@pytest.mark.parametrize("way", [*WAYS, "far away"])
+def test_a_simplified_scene_is_proved_against_the_mesh_before(way: str) -> None:
+    mesh, options = simplified(way)
+    scene = convert(mesh, options)
+    report = verify(scene, mesh, FEW)
+    assert report.ok
+    assert report.rays > 500
+    strays = report.strays
+    assert strays is not None
+    told = scene.metadata["simplified"]
+    assert told["hausdorff_of_source"][0] * 0.99 - scene.error_bound <= strays.of_source
+    assert told["hausdorff_of_result"][0] * 0.99 - scene.error_bound <= strays.of_result
+    # The distance is that of the surfaces: vertices of each, by the slow way round.
+    points = mesh.positions[np.unique(mesh.faces)].astype(np.float64)
+    assert Surface(scene.to_mesh()).closest(points)[0].max() <= strays.of_source
+    assert report.to_dict()["strays"]["ok"]
+
+
+@pytest.mark.parametrize("which", ["source", "result"])
+def test_a_scene_that_strays_farther_than_it_says_is_not_proved(which: str) -> None:
+    mesh, options = simplified("plain")
+    scene = convert(mesh, options)
+    told = dict(scene.metadata["simplified"])
+    told[f"hausdorff_of_{which}"] = [0.0, told[f"hausdorff_of_{which}"][0] * 0.9]
+    report = verify(replace(scene, metadata={"simplified": told}), mesh, FEW)
+    assert report.disagreements == report.leaks == 0
+    assert not report.ok
+
+
+def test_another_mesh_is_not_taken_for_the_source() -> None:
+    mesh, options = simplified("plain")
+    scene = convert(mesh, options)
+    moved = replace(mesh, positions=mesh.positions + np.float32([0, 0, 0.05]))
+    report = verify(scene, moved, FEW)
+    assert report.strays is not None
+    assert not report.strays.ok
+    fewer = replace(mesh, faces=mesh.faces[:-1])
+    with pytest.raises(UsageError, match="faces once clean"):
+        strays_of(scene, fewer)
+
+
+@pytest.mark.parametrize("told", [{}, [], {"triangles_before": 4}, {"hausdorff_of_source": [1]}, "x"])
+def test_a_scene_that_does_not_say_how_far_it_strays_is_refused(told: object) -> None:
+    mesh, options = simplified("plain")
+    scene = replace(convert(mesh, options), metadata={"simplified": told})
+    with pytest.raises(UsageError, match="not how far"):
+        verify(scene, mesh, FEW)
+
+
+def test_distances_that_are_no_numbers_are_refused() -> None:
+    mesh, options = simplified("plain")
+    scene = convert(mesh, options)
+    for wrong in (-1.0, np.inf, np.nan, None, "far"):
+        told = scene.metadata["simplified"] | {"hausdorff_of_result": [0.0, wrong]}
+        with pytest.raises(UsageError, match="not how far"):
+            strays_of(replace(scene, metadata={"simplified": told}), mesh)
+
+
+def test_a_wrong_hit_of_a_simplified_scene_is_seen() -> None:
+    """Rays are judged by the scene's own triangles: one that the tracer loses is a leak or a disagreement."""
+
+    class Blind:
+        def __init__(self, tracer) -> None:
+            self.tracer = tracer
+
+        def closest_hit(self, origins: np.ndarray, directions: np.ndarray):
+            hits = self.tracer.closest_hit(origins, directions)
+            hits.face[::3] = hits.triangle[::3] = -1
+            hits.t[::3] = np.inf
+            return hits
+
+    from striptools.trace import Tracer
+
+    mesh, options = simplified("plain")
+    scene = convert(mesh, options)
+    report = verify(scene, mesh, FEW, tracer=Blind(Tracer(scene)))
+    assert report.leaks + report.disagreements > 0
+    assert not report.ok
+
+
+def test_own_faces_stand_at_their_numbers() -> None:
+    scene = convert(source_mesh("plain"))
+    alone, mesh = own_source(scene)
+    assert mesh.triangle_count == scene.source_face_count == alone.source_face_count
+    assert (mesh.faces[:2] == 0).all()
+    assert alone.remap is not None
+    kept = mesh.positions[mesh.faces[alone.remap.face]]
+    turned = kept[np.arange(len(kept))[:, None], (np.arange(3) + alone.remap.rotation[:, None]) % 3]
+    np.testing.assert_array_equal(turned, scene.positions[scene.faces()])
+
+
+def test_nothing_strays_where_all_is_declared() -> None:
+    assert Strays(1.0, 2.0, 1.0, 2.0).ok
+    assert not Strays(1.1, 2.0, 1.0, 2.0).ok
+    assert not Strays(1.0, 2.1, 1.0, 2.0).ok
+
+
+def test_the_command_line_proves_what_it_simplified(tmp_path: Path, run: Run) -> None:
+    model, scene = tmp_path / "wavy.ply", tmp_path / "wavy.rdm"
+    save_mesh(wavy(), model)
+    code, said, _ = run("convert", model, scene, "--simplify", "20%")
+    assert code == 0
+    assert "the source strays at most" in said
+    verify_it = ("verify", scene, "--against", model, "--rays", 16, "--aimed-rays", 64)
+    code, said, _ = run(*verify_it)
+    assert code == 0
+    assert "no farther than declared" in said.splitlines()[0]
+    save_mesh(wavy(height=0.2), model)
+    code, said, _ = run(*verify_it)
+    assert code == 1
+    assert "FARTHER than declared" in said.splitlines()[0]
+    code, _, said = run("convert", model, tmp_path / "b.rdm", "--simplify", "5%", "--simplify-error", "1e-6")
+    assert code == 2
+    assert "stray by up to" in said

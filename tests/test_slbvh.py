@@ -12,6 +12,7 @@ from rays import rays_at
 from scenes import scene_of, scenes, small_scene
 from shapes import SHAPES
 from strategies import sphere
+from test_trace import assert_equal_hits
 
 import striptools
 from striptools.errors import LimitError, StriptoolsError, UnreadableSceneError, UsageError
@@ -348,9 +349,8 @@ def scene_named(name, block=16):
 def assert_same_hits(scene, other, origins, directions, t_max=None):
     one, two = (Tracer(s, device="cpu", threads=1) for s in (scene, other))
     expected, found = (tracer.closest_hit(origins, directions, t_max=t_max) for tracer in (one, two))
-    for field in HIT_FIELDS:
-        np.testing.assert_array_equal(getattr(found, field), getattr(expected, field), err_msg=field)
-    np.testing.assert_array_equal(two.any_hit(origins, directions, t_max=t_max), expected.hit)
+    assert_equal_hits(HIT_FIELDS, ((scene, expected), (other, found)), origins, directions)
+    np.testing.assert_array_equal(two.any_hit(origins, directions, t_max=t_max), found.hit)
     return expected
 
 

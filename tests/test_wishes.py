@@ -107,6 +107,7 @@ def test_trade_prints_points_and_writes_a_report(
 
 def test_bench_adds_to_its_file(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     arguments = ["bench", str(model), "--quick", "--results", str(tmp_path / "b.csv"), "--format", "json"]
+    arguments += ["--only", "package"]
     assert main(arguments) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["worse"] == []

@@ -1,5 +1,6 @@
 """`striptools bench`: the project's figures on any models, kept in a file and compared with the last ones."""
 
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -7,10 +8,21 @@ from typing import Annotated
 import typer
 
 import striptools
-from striptools.errors import UsageError
-from striptools.measure.bench import QUICK, BenchOptions, append, bench, got_worse, last_rows
+from striptools.errors import EXIT_DONE, EXIT_ISSUES, UsageError
+from striptools.measure.bench import (
+    NAME,
+    NOISE,
+    QUICK,
+    BenchOptions,
+    Row,
+    append,
+    bench,
+    got_worse,
+    has_embree,
+    last_rows,
+)
+from striptools.measure.bench_scripts import Script, part_of, run_script, scripts
 from striptools.mesh.io import load_mesh
-from striptools.mesh.mesh import Mesh
 from striptools_cli import log, notice
 from striptools_cli.options import format_option, quiet_option
 from striptools_cli.progress import StageProgress
@@ -18,7 +30,7 @@ from striptools_cli.report import Format, render, render_table
 from striptools_cli.streams import say
 
 _CLONE = Path(striptools.__file__).parent.parent
-_SHOWN = ("mesh", "metric", "value", "unit", "peer", "peer_value", "ratio")
+_SHOWN = ("bench", "mesh", "metric", "value", "unit", "peer", "peer_value", "ratio")
 
 
 def run(
@@ -35,35 +47,108 @@ def run(
         str,
         typer.Option(metavar="FILE", help="The file that figures are compared with and added to."),
     ] = "bench.csv",
-    quick: Annotated[bool, typer.Option("--quick", help="Few rays and runs.")] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GROUP", help="Only this group of figures; may be given again.", show_default=False
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few rays and runs, a part of the first model: two minutes.")
+    ] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PERCENT",
+            min=0,
+            help="How much slower is no worse; 25, or 50 with --quick. Bytes and counts have none.",
+            show_default=False,
+        ),
+    ] = None,
     form: Annotated[Format, format_option("the figures")] = "text",
     quiet: Annotated[bool, quiet_option("errors and figures")] = False,
 ) -> None:
-    """Measure bytes, seconds, rays a second and verification, and say what got worse on this machine.
+    """Measure every figure beside the installed peers, and say what got worse on this machine.
 
-    Figures are added to FILE with machine and versions. embreex is measured in the same run where it is
-    installed. What needs a clone (other peers, GPUs, long runs) is in its tests/benches, and listed.
+    Figures are added to FILE with machine and versions. The group `package` (bytes, seconds, rays a second,
+    verification) is there wherever striptools is; a clone has a group for each script in its tests/benches.
+    Ends with 1 where a figure got worse or a script failed.
     """
     log.set_up(quiet=quiet)
+    groups = _groups(only or [])
     paths = _paths(models or [], meshes)
-    loaded: dict[str, Mesh] = {path.stem: load_mesh(path) for path in paths}
     file = Path(results)
     before = last_rows(file)
     notice.before_tracing(quiet=quiet)
     with StageProgress(quiet=quiet) as progress:
-        rows = bench(loaded, QUICK if quick else BenchOptions(), progress.watch)
+        rows, wrong = _measured(groups, paths, quick=quick, progress=progress)
     append(rows, file)
-    worse = got_worse(rows, before)
+    share = tolerance / 100 if tolerance is not None else NOISE * (2 if quick else 1)
+    worse = got_worse(rows, before, noise=share)
     if form == "json":
-        say(render({"rows": [asdict(row) for row in rows], "worse": worse}, "json"))
-        return
-    table = [{name: getattr(row, name) for name in _SHOWN} for row in rows]
-    say(render_table(table, form, f"added to {file}"))
+        say(render({"rows": [asdict(row) for row in rows], "worse": worse, "failed": wrong}, "json"))
+    else:
+        table = [{name: getattr(row, name) for name in _SHOWN} for row in rows]
+        say(render_table(table, form, f"added to {file}", names=_SHOWN))
+    said = [*(f"failed: {line}" for line in wrong), *(f"worse: {line}" for line in worse)]
+    if not said and not quiet:
+        said = ["nothing got worse" if before else "no earlier figures of this machine to compare with"]
     if not quiet:
-        said = [f"worse: {line}" for line in worse] or [
-            "nothing got worse" if before else "no earlier figures of this machine to compare with"
-        ]
-        say("".join(f"{line}\n" for line in [*said, *_scripts()]), error=True)
+        said += _left_out(groups, quick=quick)
+    say("".join(f"{line}\n" for line in said), error=True)
+    raise typer.Exit(EXIT_ISSUES if wrong or worse else EXIT_DONE)
+
+
+def _groups(only: list[str]) -> dict[str, Script | None]:
+    """The groups that are asked for; None stands for the package's own figures.
+
+    Raises:
+        UsageError: One of them is not here.
+    """
+    groups: dict[str, Script | None] = {NAME: None}
+    groups |= {script.group: script for script in scripts(_CLONE)}
+    for name in only:
+        if name not in groups:
+            raise UsageError(f"no group {name!r}", where="--only", remedy=f"give one of {', '.join(groups)}")
+    return {name: script for name, script in groups.items() if name in only or not only}
+
+
+def _measured(
+    groups: dict[str, Script | None], paths: list[Path], *, quick: bool, progress: StageProgress
+) -> tuple[list[Row], list[str]]:
+    """All figures of the groups that can be measured here, and what went wrong."""
+    rows: list[Row] = []
+    wrong: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        given = [part_of(paths[0], Path(folder))] if quick and any(groups.values()) else paths
+        for done, (name, script) in enumerate(groups.items()):
+            progress.watch(name, done / len(groups))
+            if script is None:
+                loaded = {path.stem: load_mesh(path) for path in paths}
+                rows += bench(loaded, QUICK if quick else BenchOptions())
+            elif not script.missing():
+                found, said = run_script(script, script.chosen(given), quick=quick)
+                rows, wrong = rows + found, wrong + said
+    return rows, wrong
+
+
+def _left_out(groups: dict[str, Script | None], *, quick: bool) -> list[str]:
+    """What could not be measured, in a line or two."""
+    missing = {name: script.missing() for name, script in groups.items() if script}
+    lines = []
+    left = [f"{name} (needs {', '.join(what)})" for name, what in missing.items() if what]
+    left += [
+        f"{name} (takes long)" for name, script in groups.items() if quick and script and not script.quick
+    ]
+    if left:
+        lines.append(f"left out: {'; '.join(left)}")
+    absent = {peer for script in groups.values() if script for peer in script.absent()}
+    absent |= set() if has_embree() or NAME not in groups else {"embreex"}
+    if absent:
+        lines.append(f"peers that are not installed: {', '.join(sorted(absent))}")
+    if not any(scripts(_CLONE)):
+        lines.append("further groups, beside other peers, are in a clone's tests/benches")
+    return lines
 
 
 def _paths(models: list[str], folder: str | None) -> list[Path]:
@@ -75,12 +160,4 @@ def _paths(models: list[str], folder: str | None) -> list[Path]:
         paths = sorted((_CLONE / "samples").glob("*.ply"))
     if not paths:
         raise UsageError("no model to measure", remedy="name some, or a folder by --meshes")
-    return paths
-
-
-def _scripts() -> list[str]:
-    """What else a clone can measure: its scripts, and what each is for."""
-    found = sorted((_CLONE / "tests" / "benches").glob("bench_*.py"))
-    heads = [path.read_text(encoding="utf-8").split('"""')[1].splitlines()[0] for path in found]
-    lines = [f"  {path.relative_to(_CLONE)}: {head}" for path, head in zip(found, heads, strict=True)]
-    return ["further figures, each by a script of this clone:", *lines] if lines else []
+    return [path.resolve() for path in paths]

@@ -6,6 +6,7 @@ import typer
 
 from striptools.errors import EXIT_DONE, EXIT_ISSUES, UsageError
 from striptools.measure.judgement import SetResult
+from striptools.measure.strays import Strays
 from striptools.measure.verify import VerifyOptions, VerifyReport, verify
 from striptools.mesh.io import load_mesh
 from striptools.reducem.reader import read_scene
@@ -49,8 +50,9 @@ def run(
     """Trace a scene file with JAX and prove it against the mesh it was made from.
 
     The faces are compared one by one. Camera rays, secondary rays and rays aimed exactly at edges and
-    vertices are traced and judged by a float64 oracle over the source. Any disagreement or leak ends in exit
-    code 1. With --test fast rays do leak: the report counts them.
+    vertices are traced and judged by a float64 oracle over the source. A simplified scene is judged by its
+    own triangles, and must stray no farther from the mesh, both ways, than it declares. Anything wrong ends
+    in exit code 1. With --test fast rays do leak: the report counts them.
     """
     log.set_up(quiet=quiet)
     options = VerifyOptions(rays=rays, aimed_rays=aimed_rays, pair_budget=pair_budget, seed=seed)
@@ -77,6 +79,8 @@ def summary(report: VerifyReport) -> str:
     """The verdict in one line."""
     faults = f"{report.disagreements:,} disagreements, {report.leaks:,} leaks"
     faces = f", {report.structure.errors:,} wrong faces" if report.structure.errors else ""
+    if report.strays is not None:
+        faces += ", no farther than declared" if report.strays.ok else ", FARTHER than declared"
     verdict = "proved" if report.ok else "NOT proved"
     return f"{verdict}, {human_value(report.rays)} rays, {faults}{faces}"
 
@@ -96,6 +100,8 @@ def in_lines(report: VerifyReport) -> dict[str, object]:
         f"{structure.present:,} of {structure.expected:,} expected; {structure.missing:,} missing, "
         f"{structure.unexpected:,} unexpected, {structure.wrong:,} wrong, {structure.excused:,} excused"
     )
+    if report.strays is not None:
+        facts["simplified"] = _strays(report.strays)
     facts["surface"] = (
         "closed" if report.closed else f"open, nothing is certain at {report.open_edges:,} edges"
     )
@@ -106,6 +112,22 @@ def in_lines(report: VerifyReport) -> dict[str, object]:
             "face, for the model is large (--pair-budget)"
         )
     return {**facts, **{f"flaw {number}": flaw for number, flaw in enumerate(report.flaws, 1)}}
+
+
+def _strays(strays: Strays) -> str:
+    there, back, allowed, allowed_back = (
+        human_value(value)
+        for value in (
+            strays.of_source,
+            strays.of_result,
+            strays.allowed_of_source,
+            strays.allowed_of_result,
+        )
+    )
+    return (
+        f"the source strays at most {there} from the scene, declared {allowed}; the scene at most {back} "
+        f"from the source, declared {allowed_back}; rays are judged by the scene's own triangles"
+    )
 
 
 def _line(part: SetResult) -> str:

@@ -5,7 +5,7 @@ import numpy as np
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
-from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, give_weights, take_ray, weigh_chunk
+from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner
 
 
@@ -175,6 +175,14 @@ def scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, 
     stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
     for axis in range(3):
         mode, width, anchor, exponent = axis_of(headers, block, axis)
+        if mode == 0 and exponent + scale_exponent >= -126:
+            # Integers of at most 24 bits and a normal power of two: float32 is exact.
+            power = np.int32((exponent + scale_exponent + 127) << 23).view(np.float32)
+            for j in range(3):
+                whole = take(words, begin + indices[j] * stride, width) + anchor
+                corners[j, axis] = np.float32(whole) * power
+            begin += width
+            continue
         unit = power_of_two(exponent + scale_exponent)
         for j in range(3):
             number = take(words, begin + indices[j] * stride, width)
@@ -229,36 +237,39 @@ def weigh_packed_hits(
         scale_exponent: Its exponent.
         t: (r,) float32, written.
         face: (r,) int32, written.
-        u: (r,) float32, written: the weight of the face's second corner.
-        v: (r,) float32, written: the weight of its third corner.
+        u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
+        v: (r,) float32, written: the weight of its third corner; or (0,).
         triangle: (r,) int32, written; -1 on a miss.
     """
+    weighed = len(u) > 0
     decoded = np.zeros((3, 3), np.float32)
     room = np.zeros(ROOM, np.float32)
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
     held = 0
+    last, turn = np.int64(-1), np.int64(0)
     for k in range(len(at)):
         r = at[k]
         if r >= 0:
             t[r] = found_t[k]
-            if found[k] < 0:
-                face[r] = found[k]
-                triangle[r] = -1
+            block = np.int64(found[k]) >> 8
+            number = np.int64(-1)
+            face[r] = found[k]
+            if block >= 0:
+                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
+                face[r] = faces[number] if len(faces) > 0 else number
+            triangle[r] = number
+            if weighed and block < 0:
                 u[r] = 0.0
                 v[r] = 0.0
-            else:
-                block = np.int64(found[k]) >> 8
-                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
-                triangle[r] = number
-                face[r] = faces[number] if len(faces) > 0 else number
-
-                # Decode the triangle, and turn it as the tests do.
-                bit = np.int64(headers[block, 1]) << 5
-                counts = block_counts(headers, block)
-                indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
-                scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
-                turn = first_corner(decoded)
+            elif weighed:
+                # Decode the triangle, unless it was hit just before, and turn it as the tests do.
+                if number != last:
+                    bit = np.int64(headers[block, 1]) << 5
+                    counts = block_counts(headers, block)
+                    indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
+                    scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
+                    last, turn = number, np.int64(first_corner(decoded))
                 axes = take_ray(origins, directions, r, room, held)
                 for axis in range(3):
                     for j in range(3):
@@ -270,7 +281,5 @@ def weigh_packed_hits(
                 turn_of[held] = (turn + rotations[number]) % 3 if len(rotations) > 0 else turn
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
-            weigh_chunk(room, scale)
-            for i in range(held):
-                give_weights(room, i, turn_of[i], ray_of[i], u, v)
+            weigh_held(room, held, scale, ray_of, turn_of, u, v)
             held = 0

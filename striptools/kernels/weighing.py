@@ -87,6 +87,14 @@ def give_weights(room, i, turn, r, u, v):
     v[r] = room[WEIGHTS + (2 - turn) * CHUNK + i]
 
 
+@inlined
+def weigh_held(room, held, scale, ray_of, turn_of, u, v):
+    """Write u and v of the first `held` places of a chunk, of these rays and turns."""
+    weigh_chunk(room, scale)
+    for i in range(held):
+        give_weights(room, i, turn_of[i], ray_of[i], u, v)
+
+
 @kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
@@ -102,13 +110,14 @@ def weigh_hits(
         place: (f,) int32, see `fill_leaf_blocks`.
         blocks: (l, 10, 8) float32, see `fill_leaf_blocks`.
         scale: float32, what positions in `blocks` were multiplied by.
-        triangle_of: (f,) int32, the triangle in file order of each face.
+        triangle_of: (f,) int32, the triangle in file order of each face; (0,) where faces are triangles.
         t: (r,) float32, written.
         face: (r,) int32, written.
-        u: (r,) float32, written: the weight of the face's second corner.
-        v: (r,) float32, written: the weight of its third corner.
+        u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
+        v: (r,) float32, written: the weight of its third corner; or (0,).
         triangle: (r,) int32, written; -1 on a miss.
     """
+    weighed = len(u) > 0
     room = np.zeros(ROOM, np.float32)
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
@@ -119,12 +128,11 @@ def weigh_hits(
             t[r] = found_t[k]
             name = found_face[k]
             face[r] = name
-            if name < 0:
+            triangle[r] = triangle_of[name] if name >= 0 and len(triangle_of) > 0 else max(name, -1)
+            if weighed and name < 0:
                 u[r] = 0.0
                 v[r] = 0.0
-                triangle[r] = -1
-            else:
-                triangle[r] = triangle_of[name]
+            elif weighed:
                 slot = place[name]
                 kx, ky, kz = take_ray(origins, directions, r, room, held)
                 block, lane = slot >> 5, (slot >> 2) & 7
@@ -136,7 +144,5 @@ def weigh_hits(
                 turn_of[held] = slot & 3
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
-            weigh_chunk(room, scale)
-            for i in range(held):
-                give_weights(room, i, turn_of[i], ray_of[i], u, v)
+            weigh_held(room, held, scale, ray_of, turn_of, u, v)
             held = 0

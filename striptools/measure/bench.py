@@ -1,17 +1,19 @@
 """The figures of this project on any models, beside the peers that are installed, kept in a results file.
 
-A row is a figure, with machine and versions. What is here needs no clone: bytes, seconds, rays a second, and
-what verify says. The figures that need a clone's own scripts (long runs, peers' encoders, GPUs) are in
-tests/benches, in the same columns.
+A row is a figure, with machine and versions. What is measured here needs no clone: bytes, seconds, rays a
+second, and what verify says. The figures that need a clone's own scripts (long runs, peers' encoders, GPUs)
+are in tests/benches, in the same columns; `bench_scripts` runs them.
 """
 
 import csv
 import datetime
 import io
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -35,13 +37,30 @@ COLUMNS = (
     "peer", "peer_value", "ratio", "note",
 )  # fmt: skip
 
-LOWER_IS_BETTER = ("bytes per triangle", "s", "rays", "vertices per triangle")
-"""Units of which less is better; more is better of all others."""
+RATES = ("M rays/s", "Mray/s", "Mrays/s", "rays/s", "M triangles/s")
+"""Units of which more is better."""
 
-TOLERANCE = {"s": 0.25, "M rays/s": 0.25, "M triangles/s": 0.25}
-"""How much worse a figure of a noisy unit may be before it is said; others may not at all."""
+COSTS = ("bytes per triangle", "B/tri", "B", "s", "per triangle", "vertices per triangle", "faces", "rays")
+"""Units of which less is better, and of the figures without a unit those that begin so."""
 
-RATIO_TOLERANCE = 0.1
+COSTS_BY_NAME = ("vertices per triangle", "relative expected cost", "seconds")
+
+COUNTS = (
+    "rays verified", "aimed rays", "uncertain rays", "wrong faces", "steps", "open edges",
+    "Draco", "meshoptimizer", "vtkStripper", "pyffi", "plain CUDA",
+)  # fmt: skip
+"""What is in the names of figures that are neither better nor worse: of an input, or of a peer alone."""
+
+NOISE = 0.25
+"""How much worse seconds, rates and peaks of memory may be before it is said, where a run is long; bytes and
+counts not at all."""
+
+RATIO_NOISE = 0.4
+"""What is left of it where a figure is a ratio to a peer's of the same run."""
+
+SHORT = 0.02
+"""Seconds that are too short to be compared."""
+
 NAME = "package"
 _GRID = Options(precision=PrecisionOptions(16))
 
@@ -181,6 +200,11 @@ def _embree(corners: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarra
     return closest
 
 
+def has_embree() -> bool:
+    """Whether embreex is installed, which rates are measured beside."""
+    return find_spec("embreex") is not None
+
+
 def _timed(work: Callable[[], object]) -> float:
     start = time.perf_counter()
     work()
@@ -207,35 +231,71 @@ def append(rows: list[Row], file: Path) -> None:
     write_atomically(file, before + text.getvalue().encode())
 
 
-def last_rows(file: Path) -> dict[tuple[str, str, str], dict[str, str]]:
-    """The last row of each bench, mesh and metric that this machine measured."""
+Last = dict[tuple[str, str, str, str], dict[str, str]]
+"""Rows of a results file by bench, mesh, metric and the parameters that the note says."""
+
+
+def last_rows(file: Path) -> Last:
+    """The last row of each figure that this machine measured."""
     if not file.exists():
         return {}
     with file.open(newline="", encoding="utf-8") as lines:
         rows = [row for row in csv.DictReader(lines) if row.get("machine") == machine()]
-    return {(row["bench"], row["mesh"], row["metric"]): row for row in rows}
+    return {(row["bench"], row["mesh"], row["metric"], _parameters(row["note"])): row for row in rows}
 
 
-def got_worse(rows: list[Row], before: dict[tuple[str, str, str], dict[str, str]]) -> list[str]:
+def _parameters(note: str) -> str:
+    """A note without the figures in it: whole numbers are parameters, others were measured."""
+    return re.sub(r"\d*\.\d+(e[+-]?\d+)?|\d+e[+-]?\d+", "", note)
+
+
+def got_worse(rows: list[Row], before: Last, *, noise: float = NOISE) -> list[str]:
     """Which figures are worse than the last ones of this machine, by more than noise, in words.
 
     A ratio to a peer of the same run is what is compared where there was one before; else the figure itself.
+
+    Args:
+        rows: The new ones.
+        before: The last ones.
+        noise: How much worse what is noisy may be.
     """
     found = []
     for row in rows:
-        last = before.get((row.bench, row.mesh, row.metric))
-        if last is None:
+        last = before.get((row.bench, row.mesh, row.metric, _parameters(row.note)))
+        better = _better(row)
+        if last is None or better == 0:
             continue
-        by_ratio = row.ratio is not None and bool(last["ratio"])
+        by_ratio = row.ratio is not None and bool(last["ratio"]) and last["peer"] == row.peer
         was = float(last["ratio"] if by_ratio else last["value"])
         now = row.ratio if by_ratio and row.ratio is not None else row.value
-        slack = RATIO_TOLERANCE if by_ratio else TOLERANCE.get(row.unit, 0.0)
-        less_is_better = row.unit in LOWER_IS_BETTER and not by_ratio
-        limit = was * (1 + slack) * (1 + 1e-5) if less_is_better else was * (1 - slack) * (1 - 1e-5)
-        if now > limit if less_is_better else now < limit:
+        is_time = row.unit == "s" or row.metric.startswith("seconds")
+        if is_time and max(row.value, float(last["value"])) < SHORT:
+            continue
+        slack = _slack(row, by_ratio, noise)
+        limit = was * (1 + slack) * (1 + 1e-5) if better < 0 else was * (1 - slack) * (1 - 1e-5)
+        if now > limit if better < 0 else now < limit:
             what = f"ratio to {row.peer}" if by_ratio else row.unit
-            found.append(f"{row.mesh}: {row.metric}: {now:.4g} {what}, was {was:.4g} on {last['date']}")
+            found.append(
+                f"{row.bench}: {row.mesh}: {row.metric}: {now:.4g} {what}, was {was:.4g} on {last['date']}"
+            )
     return found
+
+
+def _better(row: Row) -> int:
+    """1 where more is better, -1 where less is, else 0; a ratio to a peer goes as its figure does."""
+    if any(part in row.metric for part in COUNTS):
+        return 0
+    if row.unit in RATES:
+        return 1
+    return -1 if row.unit in COSTS or (not row.unit and row.metric.startswith(COSTS_BY_NAME)) else 0
+
+
+def _slack(row: Row, by_ratio: bool, noise: float) -> float:
+    """How much worse, relatively, is no worse."""
+    timed = row.unit == "s" or row.unit in RATES or row.metric.startswith("seconds")
+    if timed:
+        return noise * RATIO_NOISE if by_ratio else noise
+    return noise if "peak" in row.metric else 0.0
 
 
 def _short(value: float | None) -> str:

@@ -16,6 +16,7 @@ from striptools.measure.aimed import Surface
 from striptools.measure.judgement import Judge, SetResult
 from striptools.measure.oracle import Oracle, OracleHits
 from striptools.measure.ray_sets import RaySet, aimed_sets, camera_set, inside_sets, secondary_set
+from striptools.measure.strays import Strays, is_simplified, own_source, strays_of
 from striptools.measure.structure import Structure, compare_structure, rounded_positions
 from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
@@ -76,6 +77,8 @@ class VerifyReport:
         error_bound: The scene's.
         closed: Whether every edge of the scene's surface has exactly two faces in opposite directions.
         open_edges: Edges that have not: nothing is certain there.
+        strays: How far the scene is from its source, where it was simplified; all else is then judged by the
+            scene's own triangles. Else None.
     """
 
     sets: tuple[SetResult, ...]
@@ -85,6 +88,7 @@ class VerifyReport:
     error_bound: float
     closed: bool
     open_edges: int
+    strays: Strays | None = None
 
     @property
     def rays(self) -> int:
@@ -143,8 +147,9 @@ class VerifyReport:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong: no disagreement, no leak, every face there."""
-        return self.disagreements == 0 and self.leaks == 0 and self.structure.errors == 0
+        """Whether nothing is wrong: no disagreement, no leak, every face there, no farther than declared."""
+        near = self.strays is None or self.strays.ok
+        return near and self.disagreements == 0 and self.leaks == 0 and self.structure.errors == 0
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values for JSON: totals, `structure`, and `sets` row by row."""
@@ -168,6 +173,7 @@ class VerifyReport:
         )
         found: dict[str, Any] = {name: getattr(self, name) for name in totals}
         found["structure"] = {**asdict(self.structure), "errors": self.structure.errors}
+        found["strays"] = None if self.strays is None else {**asdict(self.strays), "ok": self.strays.ok}
         found["sets"] = [{**asdict(part), "flaws": list(part.flaws)} for part in self.sets]
         return found
 
@@ -190,7 +196,9 @@ def verify(
     Args:
         scene: The scene.
         source: The mesh it was made from, as loaded: not cleaned. For a scene with instances also with
-            them; flattened, its faces that vanish where an instance stands are taken for missing.
+            them; flattened, its faces that vanish where an instance stands are taken for missing. For a
+            simplified scene the mesh before: the surfaces are then compared (`strays`), and rays judged by
+            the scene's own triangles.
         options: How much is traced.
         tracer: What traces the scene; a `striptools.trace.Tracer` of it when None.
         watch: Called with "structure" or "rays" and the fraction done.
@@ -199,6 +207,9 @@ def verify(
     Raises:
         UsageError: The source has another number of faces than the one that the scene was made from.
     """
+    if is_simplified(scene, source):
+        strays = strays_of(scene, source)
+        return replace(verify(*own_source(scene), options, tracer=tracer, watch=watch), strays=strays)
     placed = scene.placed()
     source, kept = _where_it_stands(scene, placed, source)
     if scene.origin is not None:

@@ -41,6 +41,9 @@ CHUNK = 1 << 16
 SLACK = 1 + 2.0**-50
 """What float64 may add to a bound or a distance of a few operations."""
 
+STRETCH_SLACK = 2.0**-18
+"""In powers of two, by how much cells may be larger than asked for: `Instances.stretch` is that inexact."""
+
 
 @dataclass(frozen=True)
 class PrecisionOptions:
@@ -123,20 +126,22 @@ def grid_exponent_for(bounds: np.ndarray, bits: int) -> int:
     return exponent
 
 
-def exponent_for_error(bounds: np.ndarray, largest: float, already: float = 0.0) -> int:
+def exponent_for_error(bounds: np.ndarray, largest: float, already: float = 0.0, stretch: float = 1.0) -> int:
     """The coarsest grid of 8 to 24 bits whose bound is at most `largest`.
 
     Args:
         bounds: (2, 3), the least and the largest coordinates, finite.
         largest: In the model's unit.
         already: How far positions may have moved before.
+        stretch: How much longer a distance may become where instances stand.
 
     Raises:
         UsageError: 24 bits are not enough.
     """
     for bits in range(LEAST_BITS, MOST_BITS + 1):
-        exponent = grid_exponent_for(bounds, bits)
-        if declared_bound(exponent, already) <= largest:
+        exponent = _finer(grid_exponent_for(bounds, bits), stretch)
+        placed = declared_bound(exponent, already) * (stretch * SLACK if stretch != 1.0 else 1.0)
+        if placed <= largest:
             return exponent
     raise UsageError(
         f"an error of at most {largest:.3g} takes more than {MOST_BITS} bits",
@@ -236,15 +241,19 @@ def _exponent(mesh: Mesh, precision: PrecisionOptions, already: float) -> int:
         bounds = placed_bounds(mesh.positions, mesh.geometries, mesh.instances)
         stretch = mesh.instances.stretch
     if precision.bits is not None:
-        exponent = grid_exponent_for(bounds, precision.bits)
-    else:
-        assert precision.max_error is not None
-        scale = float(np.linalg.norm(bounds[1] - bounds[0])) if precision.relative else 1.0
-        exponent = exponent_for_error(bounds, precision.max_error * scale, already * stretch)
-    if stretch == 1.0:
-        return exponent
-    finer = math.frexp(stretch)[1]
-    return min(max(exponent - finer, GRID_EXPONENTS.start), GRID_EXPONENTS.stop - 1)
+        return _finer(grid_exponent_for(bounds, precision.bits), stretch)
+    assert precision.max_error is not None
+    scale = float(np.linalg.norm(bounds[1] - bounds[0])) if precision.relative else 1.0
+    return exponent_for_error(bounds, precision.max_error * scale, already, stretch)
+
+
+def _finer(exponent: int, stretch: float) -> int:
+    """The grid whose cells are no larger than another's where instances stretch them.
+
+    A stretch has a little on top for rounding, which is no reason for a bit more.
+    """
+    finer = exponent - math.ceil(math.log2(stretch) - STRETCH_SLACK)
+    return min(max(finer, GRID_EXPONENTS.start), GRID_EXPONENTS.stop - 1)
 
 
 def _count_flipped(mesh: Mesh, again: Cleaned) -> int:

@@ -159,6 +159,9 @@ def set_cpu_devices(count: int, environ: MutableMapping[str, str]) -> bool:
 def trace_devices(kind: DeviceKind, threads: int | None) -> list["jax.Device"]:
     """The devices to trace on: one GPU, or a CPU device for each thread.
 
+    They are this process's own, also where `jax.distributed` runs several: each traces its share of the rays
+    on its own devices (`distributed`), and none waits for another while it does.
+
     Args:
         kind: "auto" takes a GPU where JAX has one.
         threads: CPU devices to use, at most those there are; None for all.
@@ -175,7 +178,7 @@ def trace_devices(kind: DeviceKind, threads: int | None) -> list["jax.Device"]:
     with quiet_jax():
         if kind != "cpu":
             try:
-                return jax.devices("gpu")[:1]
+                return jax.local_devices(backend="gpu")[:1]
             except RuntimeError as error:
                 if kind == "gpu":
                     raise UsageError(
@@ -183,7 +186,7 @@ def trace_devices(kind: DeviceKind, threads: int | None) -> list["jax.Device"]:
                         where="device",
                         remedy="install a JAX with GPU support, or use cpu",
                     ) from error
-        devices = jax.devices("cpu")
+        devices = jax.local_devices(backend="cpu")
     return devices[:threads]
 
 

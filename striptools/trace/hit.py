@@ -1,6 +1,7 @@
 """What a trace gives back: arrays over the rays, in the order the rays were given."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -18,8 +19,9 @@ class Hits:
             miss.
         u: (r,) float32, the weight of the second corner of `face`, counted from its first corner in the
             source (without
-            a remap: in the file). The point is (1-u-v) p0 + u p1 + v p2. 0 on a miss.
-        v: (r,) float32, the weight of the third corner. 0 on a miss.
+            a remap: in the file). The point is (1-u-v) p0 + u p1 + v p2. 0 on a miss. None where weights
+            were not asked for.
+        v: (r,) float32, the weight of the third corner. 0 on a miss. None where u is.
         triangle: (r,) int32, the triangle in the file's order; -1 on a miss.
         counters: (r,) int32 each, what the walk visited, tested and read; None unless asked for.
         instance: (r,) int32, the instance of the scene; -1 on a miss. None where a scene has no instances:
@@ -31,8 +33,8 @@ class Hits:
 
     t: Float32[np.ndarray, " r"]
     face: Int32[np.ndarray, " r"]
-    u: Float32[np.ndarray, " r"]
-    v: Float32[np.ndarray, " r"]
+    u: Float32[np.ndarray, " r"] | Any
+    v: Float32[np.ndarray, " r"] | Any
     triangle: Int32[np.ndarray, " r"]
     counters: Counters | None = None
     instance: Int32[np.ndarray, " r"] | None = None

@@ -19,7 +19,7 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.wide import EMPTY, WideTree, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.partition.object_split import split_objects
-from striptools.trace.box import MARGIN
+from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
 from striptools.trace.layout import Found, Layout, PacketView, Rays
@@ -31,7 +31,6 @@ from striptools.trace.walk_instances import InstancedScene, trace_instances
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
 
-U = 2.0**-24
 MOST_SLIP = 0.25
 """The most of gamma_3 k + n for which rays are moved in float32: an instance more sheared is refused."""
 
@@ -178,9 +177,13 @@ class InstancedLayout:
         hit = np.flatnonzero(instance >= 0)
         t[at] = traced[0]
         instance, rows = instance[hit], at[hit]
-        own_t, own_face, own_u, own_v, own_triangle = (np.zeros(len(hit), one.dtype) for one in found)
+        own_t, own_face, own_u, own_v, own_triangle = (
+            np.zeros(min(len(hit), len(one)), one.dtype) for one in found
+        )
         inside = (own_t, own_face, own_u, own_v, own_triangle)
-        local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
+        local = rays
+        if len(u):
+            local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
         given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
         self.geometries.weigh(local, *given, inside)
         geometry, turned = self.numbers.geometry[instance], self.mirrored[instance]
@@ -188,7 +191,8 @@ class InstancedLayout:
         triangle[rows] = own_triangle + (
             self.numbers.first_triangle[instance] - self.first_triangle[geometry]
         )
-        u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
+        if len(u):
+            u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
 
     def moved(
         self, origins: np.ndarray, directions: np.ndarray, instance: np.ndarray
@@ -332,7 +336,7 @@ def _slips(
     gamma_3, gamma_4 = 3 * U / (1 - 3 * U), 4 * U / (1 - 4 * U)
     slip = gamma_3 * k + n
     off = (gamma_4 * k + n + 2 * slip + gamma_4 * h + r) / (1 - slip)
-    test = 6 * U * (k + h + row_sum(np.abs(a)) * extent / reach)
+    test = REACH * (k + h + row_sum(np.abs(a)) * extent / reach)
     return np.where(slip < MOST_SLIP, (off + test + OTHER_SLIPS) * (1 + 2.0**-10), np.inf)
 
 

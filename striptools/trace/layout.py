@@ -11,9 +11,9 @@ Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Origins (r, 3), directions (r, 3) and t_max (r,), float32."""
 
 Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""T, face, u, v and triangle of all rays, to be filled."""
+"""T, face, u, v and triangle of all rays, to be filled; u and v are (0,) where they are not wanted."""
 
-PACKET_MARGIN = np.float32(2**-20)
+PACKET_MARGIN = np.float32(2**-19)
 """Widening of a box in units of the largest coordinate: `walk_packets`, Boxes."""
 
 MOST_TRIANGLES = 400

@@ -36,8 +36,8 @@ class LeafBlocks:
     Attributes:
         blocks: (l, 10, 8) float32, see `kernels.wide.fill_leaf_blocks`; sizes are padded.
         place: (f,) int32, of each face: (block * 8 + lane) * 4 + turn; one of them where it has several.
-        triangle_of: (f,) int32, the triangle in file order of each face that hits report; -1 for faces not
-            in the scene.
+        triangle_of: (f,) int32, the triangle in file order of each face that hits report, -1 for faces not in
+            the scene; (0,) where triangles are their own faces.
         scale: float32 power of two that positions were multiplied by.
     """
 
@@ -88,7 +88,9 @@ class ExpandedLayout:
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of its leaves are turned."""
-        return names, self.leaves.triangle_of[names], self.leaves.place[names] & 3
+        triangle_of = self.leaves.triangle_of
+        triangles = triangle_of[names] if len(triangle_of) else names
+        return names, triangles, self.leaves.place[names] & 3
 
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
@@ -104,7 +106,7 @@ class WideLayout(ExpandedLayout):
         """What packets are readied by."""
         boxes = self.arrays.nodes[0]
         box = np.concatenate([np.nanmin(boxes[:3], axis=1), np.nanmax(boxes[3:6], axis=1)])
-        return packet_view(self.arrays.frame, box, len(self.leaves.triangle_of))
+        return packet_view(self.arrays.frame, box, len(self.leaves.place))
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
@@ -183,8 +185,10 @@ def fill_blocks(
     place = np.zeros(face_count, np.int32)
     given = (scene.positions, faces, ids, rotations, scale, first, count)
     fill_leaf_blocks(*given, blocks, blocks.view(np.int32), place)
-    triangle_of = np.full(face_count, -1, np.int32)
-    triangle_of[ids] = triangle
+    triangle_of = np.zeros(0, np.int32)
+    if scene.remap is not None:
+        triangle_of = np.full(face_count, -1, np.int32)
+        triangle_of[ids] = triangle
     return LeafBlocks(blocks, place, triangle_of, scale)
 
 

@@ -28,6 +28,11 @@ def larger(a: Array, b: Array) -> Array:
     return jnp.where(a > b, a, b)
 
 
+def any_lane(flags: Array) -> Array:
+    """Whether any lane's flag is set: quicker than jnp.any, which compares booleans one by one."""
+    return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
+
+
 def in_range(t: Array) -> Array:
     """A positive t, no less than the least normal float32 and no more than the largest: a hit stays one."""
     t = jnp.where(t < HIGHEST, t, HIGHEST)

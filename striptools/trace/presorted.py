@@ -63,7 +63,8 @@ def _hold(scene: "Scene | Placed", count: int) -> tuple[LeafBlocks, np.ndarray]:
     lanes[:count, :, 0] = blocks[:, :9].transpose(0, 2, 1).reshape(-1, 9)[:count]
     faces = aligned_zeros((room,), np.int32)
     faces[:count] = blocks[:, 9].reshape(-1)[:count].view(np.int32)
-    place = np.maximum(filled.triangle_of, 0) * np.int32(4 * WIDTH) + (filled.place & 3)
+    triangle = filled.triangle_of if len(filled.triangle_of) else np.arange(len(filled.place), dtype=np.int32)
+    place = np.maximum(triangle, 0) * np.int32(4 * WIDTH) + (filled.place & 3)
     return LeafBlocks(lanes, place, filled.triangle_of, filled.scale), faces
 
 

@@ -56,6 +56,10 @@ class Tracer:
     range, 2**-126 or the largest number. Origins beyond 2**40 times the largest coordinate of the scene get
     some finite answer. Everything else is within the bound of `measure.bound`.
 
+    Hits are the same whatever the hierarchy, residency or packets, bit for bit, but where rounding puts a hit
+    outside its triangle's own box: on slivers seen obliquely, and on triangles so small, 2**-49 of the scene,
+    that products underflow. There another path may miss it (`measure.bound`, term 9).
+
     Rays are in the frame of the scene's positions. Where the scene has an origin (`origin`, for sources in
     float64 far from zero) that is the frame about it: take the origin from those of the rays, in float64,
     before; t, u and v are the same in both.
@@ -210,6 +214,7 @@ class Tracer:
         t_max: np.ndarray | float | None = None,
         counters: bool = False,
         packets: bool = True,
+        weights: bool = True,
     ) -> Hits:
         """Find what each ray hits first.
 
@@ -220,6 +225,7 @@ class Tracer:
             counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
             packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side:
                 those of a camera or towards a light. Hits are the same. Not of other tests than the default.
+            weights: Tell u and v; without them each is None, and hits are not weighed on this side.
 
         Raises:
             UsageError: The arrays are not of these shapes, or not numbers.
@@ -227,7 +233,7 @@ class Tracer:
         """
         rays = checked_rays(origins, directions, t_max)
         count = len(rays[0])
-        t, u, v = np.full(count, np.inf, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+        t, (u, v) = np.full(count, np.inf, np.float32), np.zeros((2, count if weights else 0), np.float32)
         face, triangle = np.full(count, MISS), np.full(count, MISS)
         dropped = np.zeros(count, np.uint8)
         counted = np.zeros((count if counters else 0, KINDS), np.int32)
@@ -242,7 +248,8 @@ class Tracer:
         if counters:
             counted[dropped == 1] = self._layout.missed if not self._empty else 0
         counted = counters_of(counted) if counters else None
-        return Hits(t, face, u, v, triangle, counted, *_instances_of(self._numbers, face, triangle))
+        told = (t, face, u, v, triangle) if weights else (t, face, None, None, triangle)
+        return Hits(*told, counted, *_instances_of(self._numbers, face, triangle))
 
     def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
@@ -257,6 +264,8 @@ class Tracer:
     def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`, weights by the precision of the test."""
         self._layout.weigh(rays, at, traced, found)
+        if not len(found[2]):
+            return
         if self._test == "fast":
             weights_inside(at, found)
         elif self._test != "watertight":

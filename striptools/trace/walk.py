@@ -37,6 +37,7 @@ from striptools.trace.counters import Counters
 from striptools.trace.numerics import (
     BY_XLA,
     Arithmetic,
+    any_lane,
     folded,
     in_range,
     index,
@@ -62,6 +63,9 @@ START = 4
 
 DONE = np.int32(-(2**31))
 """The next child of a ray that has nothing left to visit."""
+
+HIT = np.int32(0)
+"""The name of whatever any hit finds."""
 
 MISS = np.int32(-1)
 STUCK = np.int32(-2)
@@ -503,18 +507,23 @@ def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
     return Best(folded(t, smaller), t, jnp.where(closer, name, best.name))
 
 
-def closest_name(best: Best, any_hit: bool, scene: WalkScene | None = None) -> Array:
+def found_any(best: Best, t: Array) -> Best:
+    """What any hit has found, with t of eight triangles: once it is something, `nearest` is zero."""
+    hit = (t > 0) & (t < best.t)
+    return best._replace(nearest=jnp.where(any_lane(hit), np.float32(0), best.nearest))
+
+
+def closest_name(best: Best, scene: WalkScene | None = None) -> Array:
     """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
 
     Args:
         best: In each lane.
-        any_hit: Any of them will do.
         scene: Where names are not faces.
     """
     held = (best.t == best.nearest) & (best.name >= 0)
     names = jnp.where(held, best.name, NO_NAME)
     least = folded(names, smaller)
-    if scene is not None and scene.has_faces and not any_hit:
+    if scene is not None and scene.has_faces:
         several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
         least = lax.cond(several, lambda: _name_of_least(scene, names), lambda: least)
     return jnp.where(least == NO_NAME, MISS, least)
@@ -699,7 +708,10 @@ def _result(
     """What is reported of a ray: t in the caller's units, the name of the triangle, what was counted."""
     if isinstance(best, Gathered):
         t, name, count = best.t, best.name, best.counted
+    elif any_hit:
+        t, name = best.nearest, jnp.where(best.nearest < ray.t_max, HIT, MISS)
+        count = jnp.zeros(0, jnp.int32)
     else:
-        t, name, count = best.nearest, closest_name(best, any_hit, scene), jnp.zeros(0, jnp.int32)
+        t, name, count = best.nearest, closest_name(best, scene), jnp.zeros(0, jnp.int32)
     t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(t * ray.t_unit))
     return t, jnp.where(place.child != DONE, STUCK, name), count

@@ -24,12 +24,12 @@ so that the point P that it reaches at t and the place Q of the point that is hi
     |P - Q| <= |A| e + gamma_3 |A||W||t d| + |E| (|o| + |t d|) + |r|,   |t d| <= |o| + |Q| + |P - Q|.
 
 Let k be the largest row sum of |A||W|, n that of |E|, h the largest entry of |A||w|, and s the largest of |o|
-and of the placed scene. The point hit may lie 6 u M outside the geometry's box, M the largest coordinate
-there of origin and geometry (`box`, difference 1), which A enlarges to 6 u (k s + h + a), a the largest row
+and of the placed scene. The point hit may lie 8 u M outside the geometry's box, M the largest coordinate
+there of origin and geometry (`box.REACH`), which A enlarges to 8 u (k s + h + a), a the largest row
 sum of |A| times the geometry's largest coordinate. All in all Q is within f s of the ray, for
 
     f s = ((gamma_4 k + n) s + 2 (gamma_3 k + n) s + gamma_4 h + |r|) / (1 - gamma_3 k - n)
-          + 6 u (k s + h + a)
+          + 8 u (k s + h + a)
 
 and an instance whose box, widened by f s, the ray does not meet before the closest hit has nothing to say.
 `instanced` computes f, and each lane of a node holds the largest f below it. For turned and evenly scaled

@@ -22,7 +22,7 @@ distance to it, with margin m, is computed as
 In units of position, with u = 2^-24 and M the largest of |o| and the scene's coordinates, rounding o + m and
 taking L away and multiplying by v moves it by at most u (M + 2 * 2M); the product with K by u 2M, none of it
 where fused. The last sum is relative to the distance itself, which `box.FAR_FACTOR` allows for. That is 7 uM,
-and the triangle test needs 6 uM more (`box`, difference 2): `MARGIN` is 32 uM, a power of two. A cell that
+and the triangle test needs 8 uM more (`box.REACH`): `MARGIN` is 32 uM, a power of two. A cell that
 would be denormal counts as zero: its planes move by less than 2^-100.
 """
 
@@ -36,7 +36,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import index
+from striptools.trace.numerics import any_lane, index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
@@ -46,6 +46,7 @@ from striptools.trace.walk import (
     Leaf,
     Traced,
     WalkOptions,
+    found_any,
     replaced,
     walk_rays,
 )
@@ -218,8 +219,10 @@ class PackedScene(NamedTuple):
 
         leaf = decoded()
         t = leaf.crossings(shear, test=options.test, again=decoded)
-        found = _any((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, leaf.name, options.any_hit), lambda: best)
+        if options.any_hit:
+            return found_any(best, t)
+        found = any_lane((t > 0) & (t <= best.t))
+        return lax.cond(found, lambda: self._merged(best, t, leaf.name), lambda: best)
 
     def triangles_of(self, child: Array) -> Array:
         """() int32: how many triangles a run has."""
@@ -234,14 +237,12 @@ class PackedScene(NamedTuple):
         """Walk r rays made ready."""
         return walk_rays(self, ready, options)
 
-    def _merged(self, best: Best, t: Array, name: Array, any_hit: bool) -> Best:
+    def _merged(self, best: Best, t: Array, name: Array) -> Best:
         """The closest hits with those of a run; faces are only read for hits at the same t."""
         tied = (t > 0) & (t == best.t)
-        if any_hit:
-            tied = jnp.zeros_like(tied)
-        elif self.has_faces:
+        if self.has_faces:
             mine, others = (lambda: self.faces_of(name)), (lambda: self.faces_of(best.name))
-            tied = lax.cond(_any(tied), lambda: tied & (mine() < others()), lambda: tied)
+            tied = lax.cond(any_lane(tied), lambda: tied & (mine() < others()), lambda: tied)
         else:
             tied = tied & (name < best.name)
         return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
@@ -470,11 +471,6 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
     return jnp.where(last, 2, jnp.where(before(1, 0), 1, 0))
 
 
-def _any(flags: Array) -> Array:
-    """Whether any lane's flag is set."""
-    return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
-
-
 def _number(a: Array) -> Array:
     """A small unsigned integer as float32, by way of int32: one instruction."""
     return a.astype(jnp.int32).astype(jnp.float32)
@@ -516,3 +512,18 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # 0.92. No gain: the closest hit by the least integer, any lane by a sum of integers, one count of bits in the
 # place of two, fewer words of a record read, hits weighed in two passes of 64. Three words a vertex in the
 # place of the four that the widest blocks need would give 1.02.
+#
+# In packets: 0.48-0.50 of expanded packets when they came, the run found once 0.56, the header too 0.585,
+# a node's grid read once an axis 0.60, leaves that no ray of the packet meets left unread 0.62 (of the
+# dragon's 18 leaves a packet one in five). Bunny 0.49 to 0.54. One by one the run found once is 1.00 to 1.02,
+# the header too 0.97: there latency counts, and what is kept goes through memory.
+#
+# XLA compiles each of the nine coordinates of a leaf on its own, with all that leads to it; LLVM unrolls a
+# loop of eight that is short before it makes vectors of it, so that short ones end as scalars and recomputing
+# is often the faster. Of what was tried in packets / one by one against the run and header found once, lost:
+# corner indices kept by a division by ones 0.97-1.03 / 0.95; their bits shifted into rows of a small array
+# 0.86 / 0.78; three corners as 24 lanes 0.90 / 0.70, ten vertices as 16 lanes with far corners gathered 0.92,
+# all as one (3, 3, 8) array behind two conds 0.87 / 0.56; coordinates cut straight from the four words 0.98,
+# modes blended by masks 0.99. A cache of 64 to 4096 leaves decoded lately, filled in a loop of one turn: 0.55
+# to 1.0 in packets (nearly half of the visits miss in 1024 leaves) and 0.90 one by one: looking is as dear as
+# decoding.

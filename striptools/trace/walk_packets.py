@@ -16,7 +16,7 @@ Differences:
 
 **Boxes.** With u = 2^-24 and M the largest of origins and scene, distances along the axis are off by at most
 2uM, a slope (at most 1, widened by 8u) times one by 3uM more, sums by 2uM: 7uM, and the triangle test needs
-6uM. `MARGIN` is 16uM for expanded scenes.
+8uM (`box.REACH`); sides of packed boxes are rounded too, by uM. The margin is 32uM (`layout.PACKET_MARGIN`).
 
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """
@@ -238,36 +238,27 @@ def _next_bit(bits: Array) -> tuple[Array, Array]:
     return place, bits & ~(jnp.uint32(1) << place)
 
 
-class _Sifted(NamedTuple):
-    """A leaf at hand, and which of its triangles and which rays are left, as bits."""
-
-    leaf: Leaf
-    triangles: Array
-    rays: Array
-
-
 def _sides(corners: Sequence[Array]) -> tuple[Array, Array]:
     """The least and the largest of three coordinates."""
     a, b, c = corners
     return smaller(smaller(a, b), c), larger(larger(a, b), c)
 
 
-def _sifted(packet: _Packet, leaf: Leaf, around: _Box, found: _Found) -> _Sifted:
-    """The triangles whose boxes the frustum meets, and the rays that meet the leaf's box."""
+def _triangles_in(packet: _Packet, leaf: Leaf, limit: Array) -> Array:
+    """The triangles of a leaf whose boxes the frustum meets, as bits."""
     ahead = [corner * packet.sign for corner in leaf.z]
-    met = _meets(packet, _Box(_sides(leaf.x), _sides(leaf.y), _sides(ahead)), found.limit)
-    if leaf.filled is not None:
-        met = met & leaf.filled
-    return _Sifted(leaf, _bits(met), _bits(_rays_in(packet, around, found.t)))
+    met = _meets(packet, _Box(_sides(leaf.x), _sides(leaf.y), _sides(ahead)), limit)
+    return _bits(met if leaf.filled is None else met & leaf.filled)
 
 
 def _test_leaf(
-    scene: PacketScene, packet: _Packet, sifted: _Sifted, found: _Found, options: WalkOptions
+    scene: PacketScene, packet: _Packet, child: Array, rays: Array, found: _Found, options: WalkOptions
 ) -> _Found:
-    """Test a leaf by its rays or by its triangles."""
-    leaf = sifted.leaf
-    triangles, rays = (lax.population_count(bits).astype(jnp.float32) for bits in sifted[1:])
-    by_ray = rays * RAY_OVER_TRIANGLE < triangles
+    """Test a leaf, that the `rays` (bits) may meet, by these rays or by its triangles."""
+    leaf = scene.leaf_for_packets(packet.axes, child, options.decode)
+    triangles = _triangles_in(packet, leaf, found.limit)
+    ray_count, count = (lax.population_count(bits).astype(jnp.float32) for bits in (rays, triangles))
+    by_ray = ray_count * RAY_OVER_TRIANGLE < count
     none = jnp.uint32(0)
 
     def test_ray(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -278,9 +269,9 @@ def _test_leaf(
         lane, left = _next_bit(state[0])
         return left, *_one_triangle(scene, packet, leaf, lane, state[1], state[2])
 
-    state = (jnp.where(by_ray, sifted.rays, none), found.t, found.name)
+    state = (jnp.where(by_ray, rays, none), found.t, found.name)
     state = lax.while_loop(lambda s: s[0] != 0, test_ray, state)
-    state = (jnp.where(by_ray | (sifted.rays == 0), none, sifted.triangles), *state[1:])
+    state = (jnp.where(by_ray, none, triangles), *state[1:])
     _, t, name = lax.while_loop(lambda s: s[0] != 0, test_triangle, state)
     if options.any_hit:
         # A ray that has hit something reaches no farther.
@@ -388,9 +379,13 @@ def _walk_packet(
 
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
         place = state.place
-        leaf = scene.leaf_for_packets(packet.axes, place.child, options.decode)
-        sifted = _sifted(packet, leaf, _box_of(scene, packet, place), found)
-        found = _test_leaf(scene, packet, sifted, found, options)
+        # Between the rays of a packet there may be room for a leaf: then it is not even read.
+        rays = _bits(_rays_in(packet, _box_of(scene, packet, place), found.t))
+        found = lax.cond(
+            rays != 0,
+            lambda: _test_leaf(scene, packet, place.child, rays, found, options),
+            lambda: found,
+        )
         there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
         done = found.limit < 0
         return there._replace(child=jnp.where(done, DONE, there.child)), found

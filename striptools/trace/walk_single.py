@@ -75,7 +75,7 @@ def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack:
     def one(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         ray = ready_ray(row)
         stack, ended = walk(scene, ray, stack, options)
-        name = closest_name(ended.best, options.any_hit)
+        name = closest_name(ended.best)
         t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(ended.best.nearest * ray.t_unit))
         counted = jnp.stack([jnp.asarray(each, jnp.int32) for each in ended.counters])
         counted = jnp.where(is_live(ray), counted, 0) if options.counting else jnp.zeros(0, jnp.int32)

@@ -10,7 +10,17 @@ from striptools.trace.counters import Counters
 from striptools.trace.leaf_blocks import leaf_in, test_block, triangles_in
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
-from striptools.trace.walk import WIDTH, Best, Decode, Frame, Leaf, Traced, WalkOptions, walk_rays
+from striptools.trace.walk import (
+    WIDTH,
+    Best,
+    Decode,
+    Frame,
+    Leaf,
+    Traced,
+    WalkOptions,
+    found_any,
+    walk_rays,
+)
 from striptools.trace.walk_packets import walk_packets
 
 
@@ -59,7 +69,14 @@ class WideScene(NamedTuple):
 
     def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
-        return test_block(self.blocks, index(-(child + 1)), shear, best, options.test)
+        block = index(-(child + 1))
+        if not options.any_hit:
+            return test_block(self.blocks, block, shear, best, options.test)
+
+        def at_hand() -> Leaf:
+            return leaf_in(self.blocks, block, shear.axes)
+
+        return found_any(best, at_hand().crossings(shear, test=options.test, again=at_hand))
 
     def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""

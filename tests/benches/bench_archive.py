@@ -35,6 +35,16 @@ from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.reader import open_scene
 from striptools.reducem.scene import Scene
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack"],
+    "full": [[]],
+    "quick": [[]],
+    "needs": ["zstandard"],
+    "peers": ["meshoptimizer", "zstandard", "DracoPy"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 RUNS = 3
 BITS = (None, 16)
 ZSTD_LEVELS = (12, 19)

@@ -22,6 +22,23 @@ from striptools.mesh.io import load_mesh
 from striptools.strips.alternating import AlternatingOptions, Effort, alternating_strips
 from striptools.strips.topology import classic_strips, count_classic, decode_classic, encode_strips
 
+BENCH = {
+    "takes": "folder",
+    "models": [
+        "bunny",
+        "dragon",
+        "dem_jacksboro",
+        "icub",
+        "kicad_acepack",
+        "chandelier",
+        "tree_japanesemaple",
+        "ugly_bunny_holes",
+    ],
+    "full": [[], ["--effort", "best"]],
+    "quick": [[]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
     "ugly_bunny_holes",

@@ -32,6 +32,25 @@ from striptools.strips.ordering import OrderingOptions
 from striptools.strips.topology import Strips
 from striptools.threads import every_core
 
+BENCH = {
+    "takes": "paths",
+    "models": [
+        "bunny",
+        "dragon",
+        "dem_jacksboro",
+        "icub",
+        "kicad_acepack",
+        "chandelier",
+        "tree_japanesemaple",
+        "dragon_3m5",
+        "terrain_1m",
+        "powerplant",
+    ],
+    "full": [["--blocks", "64", "128", "256"]],
+    "quick": [["--bits", "16"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 RUNS = 5
 
 

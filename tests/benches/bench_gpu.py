@@ -32,6 +32,15 @@ from striptools.trace.pallas.walk import RAYS
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import ResidentKind
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "chandelier", "dragon", "powerplant"],
+    "full": [["--twin", "--under", "slbvh"]],
+    "quick": [["--rays", "16", "--repeats", "2"]],
+    "needs": ["gpu"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 PIXELS = 1024
 TILE = 8
 

@@ -26,6 +26,15 @@ from striptools.partition.object_split import split_objects
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 
+BENCH = {
+    "takes": "paths",
+    "models": ["dragon", "bunny", "powerplant"],
+    "full": [[]],
+    "quick": [["--rays", "16", "--repeats", "2"]],
+    "needs": ["gpu", "cupy"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 LEAF = 4
 THREADS = 128
 

@@ -23,6 +23,14 @@ from striptools.trace.rays import Camera, camera_rays
 
 Rays = tuple[np.ndarray, np.ndarray]
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dem_jacksboro", "icub", "chandelier", "tree_japanesemaple", "dragon", "powerplant"],
+    "full": [[]],
+    "quick": [["--rays", "4000"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 EYES = 64
 """Points outside that rays are aimed from."""
 

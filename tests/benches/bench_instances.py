@@ -23,6 +23,14 @@ from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.memory import EXPANDED_BYTES
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dragon"],
+    "full": [[]],
+    "quick": [["--instances", "20", "--repeats", "1"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 MOST = 8_000_000
 RAYS = 100_000
 SPREAD = 20.0

@@ -26,6 +26,25 @@ from striptools.mesh.io import load_mesh, save_mesh
 from striptools.pipeline import STAGES, Options
 from striptools.reducem.quantize import PrecisionOptions
 
+BENCH = {
+    "takes": "folder",
+    "models": [
+        "bunny",
+        "dragon",
+        "dem_jacksboro",
+        "icub",
+        "kicad_acepack",
+        "chandelier",
+        "tree_japanesemaple",
+        "soup_bunny",
+        "ugly_bunny_holes",
+        "dragon_3m5",
+    ],
+    "full": [[], ["--bits", "20", "16", "12"]],
+    "quick": [[]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
     "soup_bunny", "ugly_bunny_holes",

@@ -25,6 +25,14 @@ import striptools
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dragon"],
+    "full": [[]],
+    "quick": [["--repeats", "1"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 RAYS = 1 << 17
 """Of each kind: a run from the middle of the picture."""
 

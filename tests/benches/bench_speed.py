@@ -24,6 +24,14 @@ from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import STAGES, Options, convert_with_report
 
+BENCH = {
+    "takes": "paths",
+    "models": ["dragon", "dragon_3m5", "dem_jacksboro", "terrain_1m", "terrain_4m", "terrain_16m"],
+    "full": [[], ["--cold"]],
+    "quick": [["--threads", "2", "--runs", "1"]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 WARM_UP_FACES = 50_000
 TIMED = tuple(stage for stage in STAGES if stage != "load")
 

@@ -32,6 +32,23 @@ from striptools.strips.ordering import OrderingOptions, Sequences, order_strips
 from striptools.strips.stripify import cut_for, order_cut
 from striptools.strips.tunnelling import EFFORTS, Effort
 
+BENCH = {
+    "takes": "folder",
+    "models": [
+        "tree_japanesemaple",
+        "chandelier",
+        "icub",
+        "ugly_bunny_holes",
+        "bunny",
+        "dragon",
+        "dem_jacksboro",
+        "kicad_acepack",
+    ],
+    "full": [[]],
+    "quick": [[]],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
     "ugly_bunny_holes",

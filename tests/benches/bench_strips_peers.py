@@ -35,6 +35,26 @@ from striptools.strips.alternating import AlternatingOptions, alternating_strips
 from striptools.strips.ordering import OrderingOptions
 from striptools.strips.topology import classic_strips, encode_strips
 
+BENCH = {
+    "takes": "named",
+    "models": [
+        "bunny",
+        "chandelier",
+        "kicad_acepack",
+        "dem_jacksboro",
+        "icub",
+        "tree_japanesemaple",
+        "ugly_bunny_holes",
+        "dragon",
+        "dragon_3m5",
+        "powerplant",
+    ],
+    "full": [["--traced"]],
+    "quick": [[]],
+    "peers": ["meshoptimizer", "vtk", "pyffi"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 MESHES = (
     "bunny", "dragon", "dem_jacksboro", "icub", "kicad_acepack", "chandelier", "tree_japanesemaple",
     "ugly_bunny_holes", "dragon_3m5", "powerplant",

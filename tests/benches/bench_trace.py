@@ -1,12 +1,13 @@
-"""Tracing against embreex in the same run, one thread each: camera rays and ambient occlusion rays.
+"""Tracing against embreex, and open3d where it is installed, in the same run, one thread each.
 
     python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--hierarchy both] [--record]
         [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
 occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
-any hit; through the stored hierarchy of the scene, a rebuilt one, or both. The two tracers take turns; a
-ratio is the median of the ratios of runs next to each other in time.
+any hit. Random rays: 2**18 from anywhere in the model's bounds in any direction. Through the stored hierarchy
+of the scene, a rebuilt one, or both. The tracers take turns; a ratio is the median of the ratios of runs next
+to each other in time.
 """
 
 import os
@@ -18,7 +19,10 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from embreex import rtcore, rtcore_scene
@@ -26,13 +30,24 @@ from embreex.mesh_construction import TriangleMesh
 from results import Row, append
 
 import striptools
+from striptools.measure.study import random_rays
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
 from striptools.trace.tracer import HierarchyKind
 
+BENCH = {
+    "takes": "paths",
+    "models": ["bunny", "dragon", "dragon_3m5", "dem_jacksboro", "powerplant"],
+    "full": [[]],
+    "quick": [["--repeats", "1"]],
+    "needs": ["embreex"],
+}
+"""How `striptools bench` calls this: see `measure.bench_scripts`."""
+
 PIXELS = 1024
 TILE = 8
+RANDOM = 2**18
 FAR = np.float32(1e37)
 
 Rays = tuple[np.ndarray, np.ndarray]
@@ -56,6 +71,29 @@ class Embree:
         """Whether each ray hits anything."""
         far = np.full(len(origins), FAR)
         return self.scene.run(origins, directions, dists=far, query="OCCLUDED") == 0
+
+
+class Open3D:
+    """The peer: Open3D's scene for casting rays, which is Embree inside, on one thread."""
+
+    def __init__(self, corners: np.ndarray) -> None:
+        open3d: Any = import_module("open3d")
+        self.tensor = open3d.core.Tensor
+        self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+        indices = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+        vertices = np.ascontiguousarray(corners.reshape(-1, 3))
+        self.scene.add_triangles(self.tensor(vertices), self.tensor(indices))
+        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The face that each ray hits first, -1 for none."""
+        rays = self.tensor(np.concatenate([origins, directions], axis=1))
+        return self.scene.cast_rays(rays, nthreads=1)["primitive_ids"].numpy().view(np.int32)
+
+    def any(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether each ray hits anything."""
+        rays = self.tensor(np.concatenate([origins, directions], axis=1))
+        return self.scene.test_occlusions(rays, nthreads=1).numpy()
 
 
 def main() -> int:
@@ -91,22 +129,31 @@ def measure(name: str, scene: Scene, hierarchy: HierarchyKind, repeats: int, not
     tracer = Tracer(scene, device="cpu", threads=1, hierarchy=hierarchy)
     build = time.perf_counter() - start
     corners = scene.positions[scene.faces()]
-    start = time.perf_counter()
-    peer = Embree(corners)
-    peer_build = time.perf_counter() - start
     count = scene.triangle_count
     note = "; ".join(filter(None, [f"{hierarchy} hierarchy", note]))
-    ratio = build / peer_build
-    rows = [Row("trace", name, count, "tracer build", build, "s", "embreex", peer_build, ratio, note)]
-    camera = tiled_camera_rays(scene)
-    occlusion = occlusion_rays(corners, camera, peer.closest(*camera))
-    calls: list[tuple[str, Rays, Callable, Callable]] = [
-        ("camera rays, closest hit", camera, lambda *r: tracer.closest_hit(*r).triangle, peer.closest),
-        ("AO rays, closest hit", occlusion, lambda *r: tracer.closest_hit(*r).triangle, peer.closest),
-        ("AO rays, any hit", occlusion, tracer.any_hit, peer.any),
-    ]
-    for metric, rays, ours, theirs in calls:
-        rows.append(_compare(name, count, metric, rays, ours, theirs, repeats, note))
+    rows: list[Row] = []
+    camera, anywhere = tiled_camera_rays(scene), random_rays(scene, RANDOM)
+    occlusion: Rays | None = None
+    for peer_name, make in (("embreex", Embree), ("open3d", Open3D)):
+        start = time.perf_counter()
+        try:
+            peer = make(corners)
+        except ImportError:
+            continue
+        peer_build = time.perf_counter() - start
+        given = "trace", name, count, "tracer build", build, "s", peer_name, peer_build
+        rows.append(Row(*given, build / peer_build, note))
+        if occlusion is None:
+            occlusion = occlusion_rays(corners, camera, peer.closest(*camera))
+        for metric, rays, call, other in (
+            ("camera rays, closest hit", camera, "closest", peer.closest),
+            ("AO rays, closest hit", occlusion, "closest", peer.closest),
+            ("AO rays, any hit", occlusion, "any", peer.any),
+            ("random rays, closest hit", (anywhere.origins, anywhere.directions), "closest", peer.closest),
+        ):
+            ours = tracer.any_hit if call == "any" else lambda *r: tracer.closest_hit(*r).triangle
+            found = _compare(name, count, metric, rays, ours, other, repeats, note)
+            rows.append(replace(found, peer=peer_name))
     return rows
 
 

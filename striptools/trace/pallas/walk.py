@@ -33,6 +33,7 @@ from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
     FLOATS,
+    HIT,
     MISS,
     NO_NAME,
     SLACK,
@@ -262,10 +263,15 @@ class _Walk:
         )
 
     def closest_name(self, state: _State) -> Array:
-        """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none."""
+        """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
+
+        Of any hit `HIT`.
+        """
+        if self.options.any_hit:
+            return jnp.where(state.nearest < self.ray.t_max, HIT, MISS)
         held = (state.t == state.nearest) & (state.name >= 0)
         names = jnp.where(held, state.name, NO_NAME)
-        if self.has_faces and not self.options.any_hit:
+        if self.has_faces:
             faces = jnp.where(held, self.tile.among(held).faces_of(state.name), NO_NAME)
             names = jnp.where(faces == _over_lanes(jnp.min, faces), names, NO_NAME)
         least = _over_lanes(jnp.min, names)

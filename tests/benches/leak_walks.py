@@ -1,0 +1,141 @@
+"""The walks and the peers that the leak table is of."""
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+
+from striptools.hierarchies.loose_octree import build_sah_bvh
+from striptools.hierarchies.options import OVER, HierarchyOptions
+from striptools.partition.boxes import range_boxes
+from striptools.reducem.scene import Scene
+from striptools.trace import Hits, Tracer
+
+
+class Traces(Protocol):
+    """What a walk is asked."""
+
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, packets: bool = True) -> Hits:
+        """As of `Tracer`."""
+        ...
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray, packets: bool = True
+    ) -> np.ndarray:
+        """As of `Tracer`."""
+        ...
+
+
+class Gathering:
+    """The walk that gathers all hits: the first of them is the closest, and where some are counted is one."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self.tracer = tracer
+
+    def closest_hit(self, origins: np.ndarray, directions: np.ndarray, *, packets: bool = False) -> Hits:
+        """The first of all hits."""
+        found = self.tracer.all_hits(origins, directions, k=1)
+        return Hits(found.t[:, 0], found.face[:, 0], found.u[:, 0], found.v[:, 0], found.triangle[:, 0])
+
+    def any_hit(
+        self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray, packets: bool = False
+    ) -> np.ndarray:
+        """Whether hits are counted."""
+        return self.tracer.count_hits(origins, directions, t_max=t_max) > 0
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A way to keep a scene.
+
+    Attributes:
+        name: What the table calls it.
+        tracer: From a scene of the default hierarchy.
+        packets: Whether rays go in packets there too.
+    """
+
+    name: str
+    tracer: Callable[[Scene], Traces]
+    packets: bool = False
+
+
+MAIN = (
+    Walk("expanded", lambda scene: Tracer(scene, device="cpu", resident="expanded"), packets=True),
+    Walk("compressed", lambda scene: Tracer(scene, device="cpu", resident="compressed"), packets=True),
+    Walk("rebuilt", lambda scene: Tracer(scene, device="cpu", hierarchy="rebuilt"), packets=True),
+)
+"""What users get without asking for a hierarchy: every ray goes through these. The first is the reference."""
+
+
+def _under(options: HierarchyOptions) -> Callable[[Scene], Tracer]:
+    return lambda scene: Tracer(scene.under(options), device="cpu")
+
+
+def _binary(scene: Scene) -> Tracer:
+    boxes = range_boxes(scene.triangle_boxes(), scene.objects("triangles"))
+    built = build_sah_bvh(boxes, HierarchyOptions("loose-octree", over="triangles"))
+    return Tracer(replace(scene, hierarchy=built), device="cpu")
+
+
+OTHERS = (
+    Walk("binary SAH", _binary),
+    *(Walk(f"slbvh over {over}", _under(HierarchyOptions("slbvh", over))) for over in OVER["slbvh"]),
+    Walk("slbvh, morton", _under(HierarchyOptions("slbvh", balance="morton"))),
+    *(Walk(f"kdtree over {over}", _under(HierarchyOptions("kdtree", over))) for over in OVER["kdtree"]),
+    *(
+        Walk(f"loose octree over {over}", _under(HierarchyOptions("loose-octree", over)))
+        for over in OVER["loose-octree"]
+    ),
+    Walk("presorted, no nodes", _under(HierarchyOptions("presorted", levels=0))),
+    Walk("presorted, 10 levels", _under(HierarchyOptions("presorted", levels=10))),
+    Walk("all hits, expanded", lambda scene: Gathering(Tracer(scene, device="cpu", resident="expanded"))),
+    Walk("all hits, compressed", lambda scene: Gathering(Tracer(scene, device="cpu", resident="compressed"))),
+)
+
+SHARED = ("expanded", "compressed")
+"""How instances are shared."""
+
+Peer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From origins and directions to t, infinite on a miss."""
+
+
+def peers(corners: np.ndarray) -> Iterator[tuple[str, Peer]]:
+    """Each peer that is installed, with the triangles (n, 3, 3) float32 taken in."""
+    for name, make in (("embreex", _embreex), ("open3d", _open3d)):
+        with suppress(ImportError):
+            yield name, make(corners)
+
+
+def _embreex(corners: np.ndarray) -> Peer:
+    rtcore: Any = import_module("embreex.rtcore")
+    scenes: Any = import_module("embreex.rtcore_scene")
+    meshes: Any = import_module("embreex.mesh_construction")
+    device = rtcore.EmbreeDevice()
+    scene = scenes.EmbreeScene(device)
+    kept = [device, meshes.TriangleMesh(scene, corners)]
+
+    def closest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        # Embree's objects live as long as this function.
+        _ = kept
+        far = np.full(len(origins), np.float32(1e37))
+        found = scene.run(origins, directions, dists=far, output=True)
+        return np.where(found["primID"] >= 0, found["tfar"], np.float32(np.inf))
+
+    return closest
+
+
+def _open3d(corners: np.ndarray) -> Peer:
+    open3d: Any = import_module("open3d")
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    indices = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+    tensor = open3d.core.Tensor
+    scene.add_triangles(tensor(np.ascontiguousarray(corners.reshape(-1, 3))), tensor(indices))
+
+    def closest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        rays = np.concatenate([origins, directions], axis=1)
+        return scene.cast_rays(tensor(rays))["t_hit"].numpy()
+
+    return closest
