@@ -22,6 +22,9 @@ from striptools.measure.trade import Trade
 from striptools.measure.trade_targets import chosen_of
 from striptools_cli.trade import printed
 
+BENCH = {"takes": "nothing", "full": [], "quick": []}
+"""Reads what `striptools trade` wrote: nothing for `striptools bench` to run."""
+
 HERE = Path(__file__).resolve().parents[2]
 KEPT, SHIPPED = HERE / "samples" / "reports", HERE / "striptools" / TABLE
 
