@@ -1,13 +1,13 @@
 """What the targets of `convert` choose on real models, beside the best point of each one's whole trade.
 
     striptools trade MESH ... --out REPORTS
-    python tests/benches/bench_trade.py REPORTS [--keep]
+    python tests/benches/bench_trade.py [REPORTS] [--keep] [--record]
 
 The first takes 3 to 15 minutes a model, and goes on where it was interrupted. The second reads its
-points.json, prints a line for each model and target, and fails where a choice is more than a tenth worse than
-the best point by the target's own criterion. With `--keep` it writes the reports' small set, a table, a plot
-and the figures of each model, into samples/reports, and the table that targets choose by, medians of the
-trades that have every point, into the package.
+points.json, or what is kept of them where no REPORTS are given, prints a line for each model and target, and
+fails where a choice is more than a tenth worse than the best point by the target's own criterion. With
+`--keep` it writes the reports' small set, a table, a plot and the figures of each model, into samples/reports,
+and the table that targets choose by, medians of the trades that have every point, into the package.
 """
 
 import argparse
@@ -16,14 +16,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from results import Row, append
+
 from striptools.choose import TABLE, table_of
 from striptools.measure.plots_trade import plot_trade
 from striptools.measure.trade import Trade
 from striptools.measure.trade_targets import chosen_of
 from striptools_cli.trade import printed
 
-BENCH = {"takes": "nothing", "full": [], "quick": []}
-"""Reads what `striptools trade` wrote: nothing for `striptools bench` to run."""
+BENCH = {"takes": "nothing", "full": [[]], "quick": [[]]}
 
 HERE = Path(__file__).resolve().parents[2]
 KEPT, SHIPPED = HERE / "samples" / "reports", HERE / "striptools" / TABLE
@@ -38,12 +39,16 @@ DIGITS = 6
 def main() -> int:
     """Judge the targets of each trade, and keep what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("reports", type=Path)
+    parser.add_argument("reports", type=Path, nargs="?")
     parser.add_argument("--keep", action="store_true")
+    parser.add_argument("--record", action="store_true")
     arguments = parser.parse_args()
-    paths = sorted(arguments.reports.rglob("points.json"))
+    reports = arguments.reports
+    paths = sorted(reports.rglob("points.json") if reports else KEPT.glob("trade-*.json"))
     trades = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     failed = sum([not _judged(trade) for trade in trades])
+    if arguments.record:
+        append([row for trade in trades for row in _rows(trade)])
     if arguments.keep:
         for trade in trades:
             keep(trade)
@@ -60,6 +65,15 @@ def _judged(trade: dict[str, Any]) -> bool:
             f"{one.best_cost:10.4g}  ratio {one.ratio:.3f}\n"
         )
     return all(one.ratio <= WORSE for one in found)
+
+
+def _rows(trade: dict[str, Any]) -> list[Row]:
+    """What each target costs beside the best point, by the target's own criterion."""
+    given = "trade", trade["model"], trade["triangles"]
+    return [
+        Row(*given, f"target {one.target}", one.cost, "cost", "best", one.best_cost, one.ratio, one.point)
+        for one in chosen_of(trade)
+    ]
 
 
 def keep(trade: dict[str, Any]) -> None:
