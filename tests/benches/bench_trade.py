@@ -6,7 +6,7 @@
 The first takes 3 to 15 minutes a model, and goes on where it was interrupted. The second reads its
 points.json, or what is kept of them where no REPORTS are given, prints a line for each model and target, and
 fails where a choice is more than a tenth worse than the best point by the target's own criterion. With
-`--keep` it writes the reports' small set, a table, a plot and the figures of each model, into samples/reports,
+`--keep` it writes the small set of reports, a table, a plot and the figures of a model, to samples/reports,
 and the table that targets choose by, medians of the trades that have every point, into the package.
 """
 
