@@ -302,7 +302,7 @@ def test_faces_crowded_on_few_least_vertices_are_compared_in_linear_time(threads
         repeated = _repeated_faces(faces, keep, len(faces), threads)
         return repeated, time.process_time() - begin
 
-    few, many = crowd(100_000), crowd(800_000)
+    few, many = crowd(50_000), crowd(800_000)
     repeated, _ = compare(few)
     turned = np.take_along_axis(few, (np.argmin(few, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     _, first = np.unique(turned, axis=0, return_index=True)
