@@ -54,7 +54,7 @@ def run(
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Few rays and runs, a part of the first model: two minutes.")
+        bool, typer.Option("--quick", help="Few rays and runs, a part of the first model: minutes.")
     ] = False,
     tolerance: Annotated[
         float | None,
