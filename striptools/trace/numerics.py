@@ -4,7 +4,7 @@ XLA's CPU backend contracts a product and a sum to one fused multiply-add whenev
 denormals, and has slow minimum and maximum operations. The functions here say what is meant.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -26,6 +26,12 @@ def smaller(a: Array, b: Array) -> Array:
 def larger(a: Array, b: Array) -> Array:
     """The larger of two, `b` where they do not compare."""
     return jnp.where(a > b, a, b)
+
+
+def ends_of(values: Sequence[Array]) -> tuple[Array, Array]:
+    """The least and the greatest of three; not a number where the last of them is none."""
+    a, b, c = values
+    return smaller(smaller(a, b), c), larger(larger(a, b), c)
 
 
 def any_lane(flags: Array) -> Array:

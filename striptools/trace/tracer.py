@@ -263,13 +263,14 @@ class Tracer:
 
     def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`, weights by the precision of the test."""
-        self._layout.weigh(rays, at, traced, found)
-        if not len(found[2]):
-            return
-        if self._test == "fast":
-            weights_inside(at, found)
-        elif self._test != "watertight":
+        t, face, u, v, triangle = found
+        in_double = len(u) > 0 and self._test in ("exact-sign", "float64")
+        told = (t, face, u[:0], v[:0], triangle) if in_double else found
+        self._layout.weigh(rays, at, traced, told)
+        if in_double:
             weigh_in_double(self._layout, rays, at, traced[1], found)
+        elif len(u) > 0 and self._test == "fast":
+            weights_inside(at, found)
 
     def _stream(
         self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
@@ -462,8 +463,7 @@ class Tracer:
             self._need_wide_nodes()
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
-        plain = not counting and gather is None
-        plain = plain and self._test == "watertight"
+        plain = not counting and gather is None and self._test == "watertight"
         kernel = self._kernel and plain and isinstance(self._layout.arrays, WideScene | PackedScene)
         given = (self._stack_size, self._on_gpu, decode, gather, most, self._test, kernel)
         return WalkOptions(side_by_side, any_hit, counting, *given)

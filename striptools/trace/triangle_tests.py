@@ -38,7 +38,16 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.trace import numerics
-from striptools.trace.numerics import BY_XLA, Arithmetic, quotient, rounded, sign_of, with_sign_of
+from striptools.trace.numerics import (
+    BY_XLA,
+    Arithmetic,
+    any_lane,
+    ends_of,
+    quotient,
+    rounded,
+    sign_of,
+    with_sign_of,
+)
 from striptools.trace.triangle import Corners, Edges, Shear, crossing_of, edges_of, sheared
 from striptools.types import TriangleTest
 
@@ -209,7 +218,7 @@ def _exact_sign(triangles: Triangles, shear: Shear, again: Callable[[], Triangle
     corners = triangles.in_order()
     edges = edges_of(*corners, shear)
     doubt = doubt_of(corners, shear)
-    least, most = _ends((edges.a, edges.b, edges.c))
+    least, most = ends_of((edges.a, edges.b, edges.c))
     # Not a sure miss, of two sure signs that differ; nor a sure hit; and not an empty lane, all of it NaN.
     doubtful = ((most <= doubt) | (least >= -doubt)) & (least <= doubt) & (most >= -doubt)
     if triangles.filled is not None:
@@ -222,7 +231,7 @@ def _exact_sign(triangles: Triangles, shear: Shear, again: Callable[[], Triangle
     def decided() -> Array:
         return jnp.where(doubtful, _decided(again().in_order(), shear, doubtful), t)
 
-    return lax.cond(_any(doubtful), decided, lambda: t)
+    return lax.cond(any_lane(doubtful), decided, lambda: t)
 
 
 UNSETTLED = BY_XLA._replace(settled=lambda value: value)
@@ -251,17 +260,6 @@ def _largest(corners: Corners) -> Array:
     return numerics.larger(numerics.larger(a, b), c)
 
 
-def _ends(values: Corners) -> tuple[Array, Array]:
-    """The least and the greatest of three; not a number where they are not."""
-    a, b, c = values
-    return numerics.smaller(numerics.smaller(a, b), c), numerics.larger(numerics.larger(a, b), c)
-
-
-def _any(flags: Array) -> Array:
-    """Whether any lane's flag is set."""
-    return jnp.sum(jnp.where(flags, np.int32(1), np.int32(0))) != 0
-
-
 def _decided(corners: Points, shear: Shear, doubtful: Array) -> Array:
     """Where a ray goes through triangles, by exact signs; t in float64 of weights of those signs."""
     with jax.enable_x64(True):
@@ -272,8 +270,8 @@ def _decided(corners: Points, shear: Shear, doubtful: Array) -> Array:
             ~(jnp.abs(u) > size * 2.0**-50) & (size != 0) for u, size in zip(volumes, sizes, strict=True)
         ]
         unsure = doubtful & (unsure[0] | unsure[1] | unsure[2])
-        signs = lax.cond(_any(unsure), lambda: exact_signs(corners, shear), lambda: signs)
-        least, most = _ends((signs[0], signs[1], signs[2]))
+        signs = lax.cond(any_lane(unsure), lambda: exact_signs(corners, shear), lambda: signs)
+        least, most = ends_of((signs[0], signs[1], signs[2]))
         inside = ((least >= 0) & (most > 0)) | ((most <= 0) & (least < 0))
 
         weights = [jnp.where(signs[k] != 0, jnp.abs(volumes[k]), 0.0) for k in range(3)]

@@ -21,7 +21,6 @@ Differences:
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -29,7 +28,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.kernels.packets import HEAD, PACKET
-from striptools.trace.numerics import folded, in_range, index, larger, smaller
+from striptools.trace.numerics import ends_of, folded, in_range, index, larger, smaller
 from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
@@ -238,16 +237,10 @@ def _next_bit(bits: Array) -> tuple[Array, Array]:
     return place, bits & ~(jnp.uint32(1) << place)
 
 
-def _sides(corners: Sequence[Array]) -> tuple[Array, Array]:
-    """The least and the largest of three coordinates."""
-    a, b, c = corners
-    return smaller(smaller(a, b), c), larger(larger(a, b), c)
-
-
 def _triangles_in(packet: _Packet, leaf: Leaf, limit: Array) -> Array:
     """The triangles of a leaf whose boxes the frustum meets, as bits."""
     ahead = [corner * packet.sign for corner in leaf.z]
-    met = _meets(packet, _Box(_sides(leaf.x), _sides(leaf.y), _sides(ahead)), limit)
+    met = _meets(packet, _Box(ends_of(leaf.x), ends_of(leaf.y), ends_of(ahead)), limit)
     return _bits(met if leaf.filled is None else met & leaf.filled)
 
 
