@@ -330,7 +330,10 @@ def _terms(way: Any, p: Any, q: Any) -> list[Array]:
 
 
 def _sign_of_sum(terms: Array) -> Array:
-    """The sign, int32, of sums of float64 numbers, (n, ...), by an expansion that nothing is lost from."""
+    """The sign, int32, of sums of float64 numbers, (n, ...), by an expansion that nothing is lost from.
+
+    None may be so small that a rounding error is denormal, which XLA flushes: terms are multiples of 2^-447.
+    """
     count = len(terms)
 
     def grow(k: Array, expansion: Array) -> Array:
