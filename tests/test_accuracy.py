@@ -17,6 +17,7 @@ from scenes import scene_of as scene_of_clean
 from scenes import small_scene
 from strategies import clean_meshes, cube, grid, sphere
 from test_hoisting import loops_outside_hoisted_calls
+from test_trace import flushed
 
 from striptools.errors import UsageError
 from striptools.hierarchies.options import HierarchyOptions
@@ -119,9 +120,7 @@ def test_exact_signs_are_those_of_fractions(numbers: list[float], planar: int) -
     # Some rays go to a corner or to a middle, as exactly as float32 allows.
     if planar:
         target = corners[0] if planar == 1 else (corners[0] + corners[1]) / 2
-        direction = (target - origin).astype(np.float32)
-    # Denormals count as zero.
-    direction = np.where(np.abs(direction) < np.finfo(np.float32).tiny, np.float32(0), direction)
+        direction = flushed((target - origin).astype(np.float32))
     given_to = tuple(tuple(corners[k, axis][None] for k in range(3)) for axis in range(3))
     axes = tuple(np.uint32(k) for k in range(3))
     one = np.float32(1)
