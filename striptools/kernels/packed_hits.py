@@ -202,6 +202,16 @@ def scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, 
         begin += width
 
 
+@inlined
+def turned_corners(headers, words, block, number, scale_exponent, corners):
+    """Fill corners, as `scaled_corners` does, with a triangle of a block; returns the first of the order."""
+    bit = np.int64(headers[block, 1]) << 5
+    counts = block_counts(headers, block)
+    indices = corner_indices(words, bit, counts, number)
+    scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, corners)
+    return np.int64(first_corner(corners))
+
+
 @kernel
 def weigh_packed_hits(
     origins,
@@ -265,11 +275,8 @@ def weigh_packed_hits(
             elif weighed:
                 # Decode the triangle, unless it was hit just before, and turn it as the tests do.
                 if number != last:
-                    bit = np.int64(headers[block, 1]) << 5
-                    counts = block_counts(headers, block)
-                    indices = corner_indices(words, bit, counts, np.int64(found[k]) & 255)
-                    scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
-                    last, turn = number, np.int64(first_corner(decoded))
+                    own = np.int64(found[k]) & 255
+                    last, turn = number, turned_corners(headers, words, block, own, scale_exponent, decoded)
                 axes = take_ray(origins, directions, r, room, held)
                 for axis in range(3):
                     for j in range(3):

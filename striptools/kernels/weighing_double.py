@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from striptools.kernels.blocks import block_counts
 from striptools.kernels.compiled import kernel
-from striptools.kernels.packed_hits import corner_indices, scaled_corners
-from striptools.kernels.wide import first_corner, flushed
+from striptools.kernels.packed_hits import turned_corners
+from striptools.kernels.packets import longest_axis
+from striptools.kernels.wide import flushed
 
 
 @kernel
@@ -43,11 +43,7 @@ def packed_corners(names, headers, words, rotations, scale_exponent, corners, tu
     decoded = np.zeros((3, 3), np.float32)
     for k in range(len(names)):
         block, number = np.int64(names[k]) >> 8, np.int64(names[k]) & 255
-        bit = np.int64(headers[block, 1]) << 5
-        counts = block_counts(headers, block)
-        indices = corner_indices(words, bit, counts, number)
-        scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, decoded)
-        turn = first_corner(decoded)
+        turn = turned_corners(headers, words, block, number, scale_exponent, decoded)
         for axis in range(3):
             for j in range(3):
                 corners[k, axis, j] = decoded[(j + turn) % 3, axis]
@@ -75,7 +71,7 @@ def weigh_corners(origins, directions, rays, corners, turns, scale, u, v):
         # Choose the axes as the walk does.
         r = rays[k]
         dx, dy, dz = flushed(directions[r, 0]), flushed(directions[r, 1]), flushed(directions[r, 2])
-        kz = 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
+        kz = longest_axis(dx, dy, dz)
         kx = (kz + 1) % 3
         ky = (kz + 2) % 3
 
