@@ -27,7 +27,15 @@ SMALL = TradeOptions(quick=True, side=32, runs=1, picture=32, verify_rays=4, aim
 BASE = Options(instances=False, geometry_only=True, remap=True)
 """What a trade makes of the default options."""
 
-NAMES = ("default", "precision: 8 bits", "simplification: 25%", "residency: compressed")
+NAMES = (
+    "default",
+    "precision: 8 bits",
+    "simplification: 25%",
+    "residency: compressed",
+    "traced hierarchy: rebuilt",
+    "box precision: 8 bits",
+    "residency x box precision: compressed, 4 bits",
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +65,7 @@ def test_points_change_one_factor() -> None:
         factors = {setting.factor for setting in found}
         assert {"precision", "simplification", "strip cap", "block size", "hierarchy", "boxes"} < factors
         assert {"residency", "precision x simplification", "residency x boxes"} < factors
+        assert {"box precision", "residency x box precision", "traced hierarchy"} < factors
         assert (
             sum(setting == replace(found[0], factor=setting.factor, value=setting.value) for setting in found)
             == 1
@@ -95,9 +104,20 @@ def test_simplified_surfaces_are_within_certified_bounds(done: tuple[Trade, Path
 
 
 def test_compressed_has_the_same_hits_in_less_memory(done: tuple[Trade, Path]) -> None:
-    base, packed = done[0].points[0], done[0].points[-1]
+    base, packed = done[0].points[0], done[0].points[3]
     assert packed.memory_bytes < base.memory_bytes
     assert (packed.t_largest, packed.t_rms, packed.psnr) == (base.t_largest, base.t_rms, 99.0)
+
+
+def test_boxes_of_any_precision_have_the_same_hits(done: tuple[Trade, Path]) -> None:
+    base, compressed, rebuilt, planes, pair = (done[0].points[k] for k in (0, 3, 4, 5, 6))
+    for point in (rebuilt, planes, pair):
+        assert (point.t_largest, point.t_rms, point.psnr) == (base.t_largest, base.t_rms, 99.0)
+        assert point.leaks == point.disagreements == 0
+    # The same floats wider, the same bytes wider: nothing is won but what a size class is.
+    assert planes.memory_bytes == base.memory_bytes
+    assert pair.memory_bytes <= compressed.memory_bytes
+    assert rebuilt.memory_bytes != base.memory_bytes
 
 
 def test_wrong_rays_are_counted(mesh: Mesh) -> None:
@@ -122,7 +142,7 @@ def test_an_interrupted_trade_goes_on(
         module._Bench, "measured", lambda self, one: (measured.append(one.name), original(self, one))[1]
     )
     again = trade(mesh, SMALL, model="part", folder=tmp_path)
-    assert measured == [NAMES[3]]
+    assert measured == list(NAMES[3:])
     assert again.points[:3] == done[0].points[:3]
     # Other options, or a damaged file: everything again.
     for text in (json.dumps({**kept, "key": "other"}), "{"):
@@ -133,9 +153,10 @@ def test_an_interrupted_trade_goes_on(
 def test_a_point_whose_setting_changed_is_measured_again(done: tuple[Trade, Path]) -> None:
     state = json.loads((done[1] / STATE).read_text())
     wanted = few(BASE)
-    changed = (*wanted[:3], replace(wanted[3], resident="expanded"))
+    changed = (*wanted[:3], replace(wanted[3], resident="expanded"), *wanted[4:])
     assert set(module._State.opened(done[1], state["key"], wanted).points) == set(NAMES)
-    assert set(module._State.opened(done[1], state["key"], changed).points) == set(NAMES[:3])
+    kept = set(NAMES) - {NAMES[3]}
+    assert set(module._State.opened(done[1], state["key"], changed).points) == kept
 
 
 def test_rays_come_from_four_views(mesh: Mesh) -> None:

@@ -53,11 +53,11 @@ def run(
 ) -> None:
     """Measure what bytes, speed and error are traded for each other, one factor at a time.
 
-    Around the default: precision, simplification, strip cap, block size, hierarchy, boxes, residency, the
-    triangle test, a few pairs, and what the targets of convert choose. Every point is traced in turn with
-    the default and judged against the source. Boxes have one precision in this format; what can be chosen is
-    whether those inside blocks are stored or rebuilt. Needs the extras trace and, for some points, simplify;
-    with --out plots too.
+    Around the default: precision, simplification, strip cap, block size, hierarchy, boxes, residency, box
+    precision, the triangle test, a few pairs, and what the targets of convert choose. Every point is traced
+    in turn with the default and judged against the source. Boxes in files have 8 bits a plane, expanded ones
+    float32; fewer bits are measured, not stored. Needs the extras trace and, for some points, simplify; with
+    --out plots too.
     """
     log.set_up(quiet=quiet)
     folder = None if out is None else folder_for(out)
