@@ -117,7 +117,16 @@ def test_boxes_of_any_precision_have_the_same_hits(done: tuple[Trade, Path]) -> 
     # The same floats wider, the same bytes wider: nothing is won but what a size class is.
     assert planes.memory_bytes == base.memory_bytes
     assert pair.memory_bytes <= compressed.memory_bytes
-    assert rebuilt.memory_bytes != base.memory_bytes
+
+
+def test_each_way_of_tracing_is_traced(mesh: Mesh) -> None:
+    bench = module._Bench(mesh, SMALL, Options())
+    stored = bench.tracer._layout.arrays.nodes
+    of = {setting.name: setting for setting in settings(Options())}
+    for name in ("traced hierarchy: rebuilt", "box precision: 4 bits"):
+        nodes = bench._tracer(bench.scene, of[name])._layout.arrays.nodes
+        assert nodes.shape[1:] == stored.shape[1:]
+        assert not np.array_equal(nodes, stored, equal_nan=True)
 
 
 def test_wrong_rays_are_counted(mesh: Mesh) -> None:
