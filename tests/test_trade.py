@@ -11,7 +11,7 @@ import pytest
 from striptools.choose import BASELINE
 from striptools.measure import trade as module
 from striptools.measure.plots_trade import pareto, plot_trade
-from striptools.measure.report_html import pictures_of, report_html, sentences
+from striptools.measure.report_html import pictures_of, report_html, sentences, shortfalls
 from striptools.measure.study import study_rays
 from striptools.measure.trade import STATE, Trade, TradeOptions, peer_distance, trade
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
@@ -21,6 +21,7 @@ from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.pipeline import Options
 from striptools.reducem.quantize import PrecisionOptions
+from striptools_cli.trade import printed
 
 CHANDELIER = Path(__file__).parent.parent / "samples" / "chandelier.ply"
 SMALL = TradeOptions(quick=True, side=32, runs=1, picture=32, verify_rays=4, aimed_rays=64)
@@ -218,6 +219,24 @@ def test_a_report_stands_alone(done: tuple[Trade, Path]) -> None:
     assert "&lt;b&gt;&amp;" in text
     assert len(sentences(found)) == 3
     assert all(sentence in text for sentence in sentences(found))
+
+
+def test_a_share_that_is_not_reached_is_told(done: tuple[Trade, Path]) -> None:
+    """A fault: simplifying stayed at four fifths."""
+    assert shortfalls(done[0]) == []
+    base, fewer = done[0].points[0], next(p for p in done[0].points if p.factor == "simplification")
+    stuck = replace(fewer, triangles=round(0.8 * done[0].triangles))
+    other = replace(stuck, name="simplification: 5%", value="5%")
+    pair = replace(stuck, factor="precision x simplification", value="16 bits, 25%")
+    found = replace(done[0], points=(base, stuck, other, pair))
+    left = "80% of the triangles are left, no further edge collapses"
+    lines = [
+        f"not reached: simplification: 25%; 5%: {left}",
+        f"not reached: precision x simplification: 16 bits, 25%: {left}",
+    ]
+    assert shortfalls(found) == lines
+    assert all(line in report_html(found, None, {}) for line in lines)
+    assert all(line in printed(found, "md") for line in lines)
 
 
 def test_pareto_equals_a_search_over_pairs() -> None:

@@ -7,7 +7,7 @@ import typer
 
 from striptools.errors import MissingExtraError
 from striptools.measure.plots_trade import plot_trade
-from striptools.measure.report_html import pictures_of, report_html, sentences, target_lines
+from striptools.measure.report_html import pictures_of, report_html, sentences, shortfalls, target_lines
 from striptools.measure.trade import Point, Trade, TradeOptions, trade
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
@@ -113,7 +113,7 @@ def printed(found: Trade, form: Format) -> str:
         return render_table([vars(point) for point in found.points], "csv")
     rows = [_row(point) for point in found.points]
     heading = f"{found.model}: {found.triangles:,} triangles; lengths in diagonals, rays over the default's"
-    lines = sentences(found) + target_lines(found)
+    lines = sentences(found) + target_lines(found) + shortfalls(found)
     lines += [f"left out: {name}: {why}" for name, why in found.left_out.items()]
     return render_table(rows, form, heading) + "".join(f"\n{line}\n" for line in lines)
 

@@ -48,7 +48,7 @@ SPEED_SIDES: Sides = {
     "residency": "below",
     "triangle test": "right",
     "hierarchy": "left",
-    TRACED: "left",
+    TRACED: "right",
 }
 
 SHIFTS = {"left": ((-5, -3), "right"), "right": ((5, 3), "left"), "below": ((5, -5), "left")}
