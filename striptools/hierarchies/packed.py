@@ -281,10 +281,11 @@ def wide_tree(
     first, count = run_ranges(packed, block_starts)
     child = np.full((len(packed.nodes), WIDTH), EMPTY, np.int32)
     kernels.slot_children(packed.nodes, packed.top_count, packed.first_run, child)
-    if boxes is None:
-        boxes = kernels.exact_boxes(child, first, count, np.ascontiguousarray(triangle_boxes))
-    child, boxes, depth = kernels.in_visiting_order(child, boxes)
-    return WideTree(boxes, child, first, count, int(depth))
+    held = boxes
+    if held is None:
+        held = kernels.exact_boxes(child, first, count, np.ascontiguousarray(triangle_boxes))
+    child, placed, depth = kernels.in_visiting_order(child, held)
+    return WideTree(placed, child, first, count, int(depth))
 
 
 def check_packed(
