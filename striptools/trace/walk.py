@@ -187,16 +187,20 @@ class WalkScene(Protocol):
         """
         ...
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: "Decode | None") -> Leaf:
-        """The triangles of a leaf, their corners along these axes."""
+    def find_leaf(self, child: Array) -> Any:
+        """Where the triangles of a leaf are; anything where the child is none."""
         ...
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: "WalkOptions") -> Best:
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: Any, decode: "Decode | None") -> Leaf:
+        """The triangles of a leaf that `find_leaf` found, their corners along these axes."""
+        ...
+
+    def visit_leaf(self, shear: Shear, where: Any, best: Best, options: "WalkOptions") -> Best:
         """Test the triangles of a leaf, each lane against its own closest hit."""
         ...
 
-    def triangles_of(self, child: Array) -> Array:
-        """() int32: how many triangles a leaf has; anything where the child is none."""
+    def triangles_of(self, where: Any) -> Array:
+        """() int32: how many triangles a leaf has; anything where there is none."""
         ...
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
@@ -582,10 +586,12 @@ class _Walk:
     def visit_leaves(self, state: _State, bests: tuple[Found, ...]) -> tuple[_State, tuple[Found, ...]]:
         """Each ray that is at a leaf tests it and goes on."""
         at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
+        # Found for all rays at once: one's loads go on while another's are waited for.
+        where = [self.scene.find_leaf(place.child) for place in state.places]
         after = [
             lax.cond(
                 at_leaf[k],
-                partial(self.leave_leaf, k, state, bests[k]),
+                partial(self.leave_leaf, k, state, bests[k], where[k]),
                 partial(self.stay, k, state, bests[k]),
             )
             for k in range(len(self.rays))
@@ -593,19 +599,19 @@ class _Walk:
         visits = self.count(state.visits, at_leaf, _A_LEAF)
         if visits:
             tested = [
-                jnp.where(there, self.scene.triangles_of(place.child), 0)
-                for there, place in zip(at_leaf, state.places, strict=True)
+                jnp.where(there, self.scene.triangles_of(leaf), 0)
+                for there, leaf in zip(at_leaf, where, strict=True)
             ]
             visits = tuple(each + _A_TRIANGLE * count for each, count in zip(visits, tested, strict=True))
         return state._replace(places=tuple(a[0] for a in after), visits=visits), tuple(a[1] for a in after)
 
-    def leave_leaf(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
+    def leave_leaf(self, k: int, state: _State, best: Found, where: Any) -> tuple[Place, Found]:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
         if isinstance(best, Gathered):
-            best = gather_leaf(self.scene, ray.shear, ray.t_max, place.child, best, self.options)
+            best = gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
         else:
-            best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
+            best = self.scene.visit_leaf(ray.shear, where, best, self.options)
         there = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
