@@ -11,7 +11,7 @@ Differences:
 1. A few rays go side by side in one instruction stream, so that one's arithmetic fills the other's waits:
    two on a CPU, one on a GPU. A ray that has reached a leaf, or its end, waits while another is at inner
    nodes.
-2. Leaves are tested eight triangles at once, each lane keeping its own closest hit until the walk ends.
+2. Leaves are tested eight triangles at once; hits are looked at one by one only where there are any.
 3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
    the same t the one of the smaller face is kept: the result does not depend on the order of visits.
 
@@ -97,10 +97,9 @@ class Frame(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The closest hit of all, or t_max, and that in each lane, (8,): `name` is what the scene calls it."""
+    """The closest hit: its t, or t_max, and what the scene calls the triangle, or `MISS`; () each."""
 
     nearest: Array
-    t: Array
     name: Array
 
 
@@ -196,7 +195,7 @@ class WalkScene(Protocol):
         ...
 
     def visit_leaf(self, shear: Shear, where: Any, best: Best, options: "WalkOptions") -> Best:
-        """Test the triangles of a leaf, each lane against its own closest hit."""
+        """Test the triangles of a leaf, against the closest hit so far."""
         ...
 
     def triangles_of(self, where: Any) -> Array:
@@ -505,37 +504,48 @@ def _visit_node(
     return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
-def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
-    """The closest hits where `closer` says in which lanes new ones take their place."""
-    t = jnp.where(closer, t, best.t)
-    return Best(folded(t, smaller), t, jnp.where(closer, name, best.name))
+def nearer(best: Best, t: Array, name: Array, scene: WalkScene | None = None) -> Best:
+    """The closest hit, with those on eight triangles; of hits at the same t that of the least face.
+
+    Args:
+        best: So far.
+        t: (8,) float32, positive and finite only where there is a hit.
+        name: (8,) int32.
+        scene: Where names are not faces.
+    """
+    hit = (t > 0) & (t <= best.nearest)
+
+    def replace() -> Best:
+        nearest = folded(jnp.where(hit, t, np.float32(jnp.inf)), smaller)
+        held = t == nearest
+        least = folded(jnp.where(held, name, NO_NAME), smaller)
+        new = (nearest < best.nearest) | (least < best.name)
+        if scene is not None and scene.has_faces:
+            # Faces are read for hits at the same t alone.
+            several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
+            least, new = lax.cond(
+                several | (nearest == best.nearest),
+                lambda: _least_by_face(scene, jnp.where(held, name, NO_NAME), nearest, best),
+                lambda: (least, jnp.bool_(True)),
+            )
+        return Best(nearest, jnp.where(new, least, best.name))
+
+    return lax.cond(any_lane(hit), replace, lambda: best)
+
+
+def _least_by_face(scene: WalkScene, names: Array, nearest: Array, best: Best) -> tuple[Array, Array]:
+    """Of triangles hit at the same t the name of that of the least face, and whether it is the new one."""
+    faces = jnp.where(names == NO_NAME, NO_NAME, scene.faces_of(jnp.where(names == NO_NAME, 0, names)))
+    face = folded(faces, smaller)
+    least = folded(jnp.where(faces == face, names, NO_NAME), smaller)
+    before = scene.faces_of(jnp.full(WIDTH, best.name))[0]
+    return least, (nearest < best.nearest) | (face < before)
 
 
 def found_any(best: Best, t: Array) -> Best:
     """What any hit has found, with t of eight triangles: once it is something, `nearest` is zero."""
-    hit = (t > 0) & (t < best.t)
+    hit = (t > 0) & (t < best.nearest)
     return best._replace(nearest=jnp.where(any_lane(hit), np.float32(0), best.nearest))
-
-
-def closest_name(best: Best, scene: WalkScene | None = None) -> Array:
-    """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
-
-    Args:
-        best: In each lane.
-        scene: Where names are not faces.
-    """
-    held = (best.t == best.nearest) & (best.name >= 0)
-    names = jnp.where(held, best.name, NO_NAME)
-    least = folded(names, smaller)
-    if scene is not None and scene.has_faces:
-        several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
-        least = lax.cond(several, lambda: _name_of_least(scene, names), lambda: least)
-    return jnp.where(least == NO_NAME, MISS, least)
-
-
-def _name_of_least(scene: WalkScene, names: Array) -> Array:
-    faces = jnp.where(names == NO_NAME, NO_NAME, scene.faces_of(names))
-    return folded(jnp.where(faces == folded(faces, smaller), names, NO_NAME), smaller)
 
 
 class _Walked(NamedTuple):
@@ -705,7 +715,7 @@ def _nothing_found(ray: ReadyRay, options: WalkOptions) -> Found:
     """What a walk has found before it starts."""
     if options.gather is not None:
         return nothing_gathered(ray.t_max, options.most)
-    return Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32))
+    return Best(ray.t_max, jnp.int32(MISS))
 
 
 def _result(
@@ -718,6 +728,6 @@ def _result(
         t, name = best.nearest, jnp.where(best.nearest < ray.t_max, HIT, MISS)
         count = jnp.zeros(0, jnp.int32)
     else:
-        t, name, count = best.nearest, closest_name(best, scene), jnp.zeros(0, jnp.int32)
+        t, name, count = best.nearest, best.name, jnp.zeros(0, jnp.int32)
     t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(t * ray.t_unit))
     return t, jnp.where(place.child != DONE, STUCK, name), count

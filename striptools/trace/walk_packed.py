@@ -36,7 +36,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import any_lane, index
+from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
@@ -47,7 +47,7 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     found_any,
-    replaced,
+    nearer,
     walk_rays,
 )
 from striptools.trace.walk_packets import walk_packets
@@ -225,7 +225,7 @@ class PackedScene(NamedTuple):
         return self._positions(header, corners, axes, decode)
 
     def visit_leaf(self, shear: Shear, where: "_Run", best: Best, options: WalkOptions) -> Best:
-        """Decode the triangles of a run and test them, each lane against its own closest hit."""
+        """Decode the triangles of a run and test them, against the closest hit so far."""
 
         def decoded() -> Leaf:
             return self.leaf_of(shear.axes, where, options.decode)
@@ -234,8 +234,7 @@ class PackedScene(NamedTuple):
         t = leaf.crossings(shear, test=options.test, again=decoded)
         if options.any_hit:
             return found_any(best, t)
-        found = any_lane((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, leaf.name), lambda: best)
+        return nearer(best, t, leaf.name, self)
 
     def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""
@@ -249,16 +248,6 @@ class PackedScene(NamedTuple):
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
         return walk_rays(self, ready, options)
-
-    def _merged(self, best: Best, t: Array, name: Array) -> Best:
-        """The closest hits with those of a run; faces are only read for hits at the same t."""
-        tied = (t > 0) & (t == best.t)
-        if self.has_faces:
-            mine, others = (lambda: self.faces_of(name)), (lambda: self.faces_of(best.name))
-            tied = lax.cond(any_lane(tied), lambda: tied & (mine() < others()), lambda: tied)
-        else:
-            tied = tied & (name < best.name)
-        return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
 
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""

@@ -72,7 +72,7 @@ class WideScene(NamedTuple):
         return index(-(child + 1))
 
     def visit_leaf(self, shear: Shear, where: Array, best: Best, options: WalkOptions) -> Best:
-        """Test the triangles of a leaf, each lane against its own closest hit."""
+        """Test the triangles of a leaf, against the closest hit so far."""
         if not options.any_hit:
             return test_block(self.blocks, where, shear, best, options.test)
 
