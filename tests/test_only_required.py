@@ -414,7 +414,7 @@ def test_names_are_read_where_they_are_told(any_hit):
     expanded = functions(text_of(small_scene(), any_hit=any_hit))
     assert ("faces_in" in expanded) is not any_hit
     for found in (expanded, functions(text_of(small_scene(), resident="compressed", any_hit=any_hit))):
-        assert ("closest_name" in found) is not any_hit
+        assert ("nearer" in found) is not any_hit
 
 
 @pytest.mark.parametrize(

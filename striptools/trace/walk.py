@@ -504,14 +504,14 @@ def _visit_node(
     return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
-def nearer(best: Best, t: Array, name: Array, scene: WalkScene | None = None) -> Best:
+def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array] | None = None) -> Best:
     """The closest hit, with those on eight triangles; of hits at the same t that of the least face.
 
     Args:
         best: So far.
         t: (8,) float32, positive and finite only where there is a hit.
         name: (8,) int32.
-        scene: Where names are not faces.
+        faces_of: Where names are not faces, the faces of (8,) names.
     """
     hit = (t > 0) & (t <= best.nearest)
 
@@ -520,12 +520,12 @@ def nearer(best: Best, t: Array, name: Array, scene: WalkScene | None = None) ->
         held = t == nearest
         least = folded(jnp.where(held, name, NO_NAME), smaller)
         new = (nearest < best.nearest) | (least < best.name)
-        if scene is not None and scene.has_faces:
+        if faces_of is not None:
             # Faces are read for hits at the same t alone.
             several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
             least, new = lax.cond(
                 several | (nearest == best.nearest),
-                lambda: _least_by_face(scene, jnp.where(held, name, NO_NAME), nearest, best),
+                lambda: _least_by_face(faces_of, jnp.where(held, name, NO_NAME), nearest, best),
                 lambda: (least, jnp.bool_(True)),
             )
         return Best(nearest, jnp.where(new, least, best.name))
@@ -533,12 +533,14 @@ def nearer(best: Best, t: Array, name: Array, scene: WalkScene | None = None) ->
     return lax.cond(any_lane(hit), replace, lambda: best)
 
 
-def _least_by_face(scene: WalkScene, names: Array, nearest: Array, best: Best) -> tuple[Array, Array]:
+def _least_by_face(
+    faces_of: Callable[[Array], Array], names: Array, nearest: Array, best: Best
+) -> tuple[Array, Array]:
     """Of triangles hit at the same t the name of that of the least face, and whether it is the new one."""
-    faces = jnp.where(names == NO_NAME, NO_NAME, scene.faces_of(jnp.where(names == NO_NAME, 0, names)))
+    faces = jnp.where(names == NO_NAME, NO_NAME, faces_of(jnp.where(names == NO_NAME, 0, names)))
     face = folded(faces, smaller)
     least = folded(jnp.where(faces == face, names, NO_NAME), smaller)
-    before = scene.faces_of(jnp.full(WIDTH, best.name))[0]
+    before = faces_of(jnp.full(WIDTH, best.name))[0]
     return least, (nearest < best.nearest) | (face < before)
 
 

@@ -234,7 +234,7 @@ class PackedScene(NamedTuple):
         t = leaf.crossings(shear, test=options.test, again=decoded)
         if options.any_hit:
             return found_any(best, t)
-        return nearer(best, t, leaf.name, self)
+        return nearer(best, t, leaf.name, self.faces_of if self.has_faces else None)
 
     def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""
