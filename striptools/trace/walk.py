@@ -517,31 +517,33 @@ def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array]
 
     def replace() -> Best:
         nearest = folded(jnp.where(hit, t, np.float32(jnp.inf)), smaller)
-        held = t == nearest
-        least = folded(jnp.where(held, name, NO_NAME), smaller)
+        names = jnp.where(t == nearest, name, NO_NAME)
+        least = folded(names, smaller)
         new = (nearest < best.nearest) | (least < best.name)
         if faces_of is not None:
-            # Faces are read for hits at the same t alone.
-            several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
-            least, new = lax.cond(
-                several | (nearest == best.nearest),
-                lambda: _least_by_face(faces_of, jnp.where(held, name, NO_NAME), nearest, best),
-                lambda: (least, jnp.bool_(True)),
-            )
+            least, new = _first_by_face(faces_of, names, least, nearest, best)
         return Best(nearest, jnp.where(new, least, best.name))
 
     return lax.cond(any_lane(hit), replace, lambda: best)
 
 
-def _least_by_face(
-    faces_of: Callable[[Array], Array], names: Array, nearest: Array, best: Best
+def _first_by_face(
+    faces_of: Callable[[Array], Array], names: Array, least: Array, nearest: Array, best: Best
 ) -> tuple[Array, Array]:
-    """Of triangles hit at the same t the name of that of the least face, and whether it is the new one."""
-    faces = jnp.where(names == NO_NAME, NO_NAME, faces_of(jnp.where(names == NO_NAME, 0, names)))
-    face = folded(faces, smaller)
-    least = folded(jnp.where(faces == face, names, NO_NAME), smaller)
-    before = faces_of(jnp.full(WIDTH, best.name))[0]
-    return least, (nearest < best.nearest) | (face < before)
+    """Of names the one of the least face, and whether it takes the place of what was found before.
+
+    Faces are read only where there are two hits at the same t.
+    """
+
+    def by_face() -> tuple[Array, Array]:
+        faces = jnp.where(names == NO_NAME, NO_NAME, faces_of(jnp.where(names == NO_NAME, 0, names)))
+        face = folded(faces, smaller)
+        first = folded(jnp.where(faces == face, names, NO_NAME), smaller)
+        before = faces_of(jnp.full(WIDTH, best.name))[0]
+        return first, (nearest < best.nearest) | (face < before)
+
+    several = folded(jnp.where(names == NO_NAME, jnp.int32(0), jnp.int32(1)), jnp.add) > 1
+    return lax.cond(several | (nearest == best.nearest), by_face, lambda: (least, jnp.bool_(True)))
 
 
 def found_any(best: Best, t: Array) -> Best:
