@@ -27,7 +27,8 @@ from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW
 from striptools.mesh.attributes import Attribute
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer, functional

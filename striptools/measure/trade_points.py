@@ -9,7 +9,7 @@ from typing import get_args
 
 from striptools.choose import BASELINE, TARGET, TARGETS, for_target
 from striptools.hierarchies.options import HierarchyName, HierarchyOptions
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.resident import Residency
 from striptools.types import TriangleTest
