@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from striptools.mesh.clean import CleanOptions
     from striptools.mesh.io import load_mesh, save_mesh
     from striptools.mesh.mesh import Mesh
+    from striptools.options import Options, Report
     from striptools.partition.sah import PartitionOptions
-    from striptools.pipeline import Options, Report, convert, convert_with_report, open
+    from striptools.pipeline import convert, convert_with_report, open
     from striptools.reducem.scene import Scene
     from striptools.strips.ordering import OrderingOptions
 
@@ -20,10 +21,10 @@ __version__ = "0.1.0"
 _HOME = {
     "CleanOptions": "striptools.mesh.clean",
     "Mesh": "striptools.mesh.mesh",
-    "Options": "striptools.pipeline",
+    "Options": "striptools.options",
     "OrderingOptions": "striptools.strips.ordering",
     "PartitionOptions": "striptools.partition.sah",
-    "Report": "striptools.pipeline",
+    "Report": "striptools.options",
     "Scene": "striptools.reducem.scene",
     "convert": "striptools.pipeline",
     "convert_with_report": "striptools.pipeline",

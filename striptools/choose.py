@@ -20,7 +20,8 @@ from typing import IO, Any, Literal, get_args
 from striptools.errors import UsageError
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, Report, convert_with_report
+from striptools.options import Options, Report
+from striptools.pipeline import convert_with_report
 from striptools.reducem.quantize import LEAST_BITS, MOST_BITS, PrecisionOptions
 from striptools.reducem.resident import Residency, resident_bytes
 from striptools.reducem.scene import Scene

@@ -14,7 +14,7 @@ from test_blocks import KINDS, MINUS, coordinates, ribbon, strips_of
 import striptools
 from formats import VECTORS, agree, errors_of, make, mended
 from striptools.errors import UnreadableSceneError
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.reducem import archive, layout
 from striptools.reducem.blocks import Blocks, check_headers, decode_blocks, encode_blocks
 from striptools.reducem.inspection import Inspection, Section

@@ -19,7 +19,8 @@ from striptools.errors import UsageError
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.quantize import LEAST_BITS, MOST_BITS, PrecisionOptions
 from striptools.reducem.resident import resident_bytes
 from striptools.trace import Tracer

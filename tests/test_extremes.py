@@ -20,7 +20,8 @@ from striptools.measure.bound import beyond_box, frame_rays, hit_point_bound, ju
 from striptools.measure.exact import exact_pair
 from striptools.measure.extreme_rows import ERROR, KEPT, LIMIT, ROWS, Case, Row, aimed_case, ball, fan, moved
 from striptools.measure.extremes import MODES, VIOLATED, Mode, make_tracer, rows_of, run_extremes, run_row
-from striptools.pipeline import Options, convert, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert, convert_with_report
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits
 

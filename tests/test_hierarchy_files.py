@@ -18,7 +18,8 @@ from striptools.hierarchies.kdtree import KdTree
 from striptools.hierarchies.options import OVER, HierarchyOptions
 from striptools.hierarchies.packed import PackedNodes
 from striptools.hierarchies.presorted import Presorted
-from striptools.pipeline import Options, convert, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert, convert_with_report
 from striptools.reducem.check_hierarchy import cells_of, hierarchy_depth
 from striptools.reducem.plain_triangles import first_use
 from striptools.reducem.reader import open_scene, read_scene

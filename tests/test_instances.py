@@ -19,7 +19,8 @@ from striptools.mesh.attributes import Attribute
 from striptools.mesh.instances import Geometries, Instances, determinant_signs, place
 from striptools.mesh.io import load_mesh, save_mesh, unkept
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert, convert_with_report
 from striptools.reducem.joining import why_not_kept
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.reader import read_scene

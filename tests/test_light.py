@@ -9,7 +9,8 @@ from test_shared_instances import mesh_of
 from striptools.mesh.attributes import Attribute, Material
 from striptools.mesh.instances import Geometries
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.trace import Tracer
 from striptools.trace.light import Places, open_sky, spread_points
 from striptools.trace.rays import (

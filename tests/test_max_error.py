@@ -13,7 +13,8 @@ from striptools.errors import UsageError
 from striptools.mesh.clean import CleanOptions, clean
 from striptools.mesh.io import save_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem import quantize
 from striptools.reducem.quantize import PrecisionOptions, quantise
 from striptools.reducem.reader import read_scene

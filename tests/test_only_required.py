@@ -27,7 +27,8 @@ from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW
 from striptools.mesh.attributes import Attribute
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer, functional
@@ -462,7 +463,7 @@ def test_names_are_read_where_they_are_told(any_hit):
     expanded = functions(text_of(small_scene(), any_hit=any_hit))
     assert ("faces_in" in expanded) is not any_hit
     for found in (expanded, functions(text_of(small_scene(), resident="compressed", any_hit=any_hit))):
-        assert ("closest_name" in found) is not any_hit
+        assert ("nearer" in found) is not any_hit
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import striptools
 from striptools.errors import StriptoolsError
 from striptools.kernels.packets import HEAD, PACKET, ROW, ready_packets
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.trace import Tracer
 from striptools.trace import walk_packets as walk
 from striptools.trace.launch import program

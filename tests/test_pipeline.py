@@ -13,7 +13,7 @@ import striptools
 from striptools.errors import UnreadableMeshError, UsageError
 from striptools.mesh.clean import clean
 from striptools.mesh.io import save_mesh
-from striptools.pipeline import STAGES
+from striptools.options import STAGES
 from striptools.reducem.check import check_scene
 from striptools.reducem.validate import validate
 from striptools.stopwatch import Stopwatch

@@ -35,8 +35,8 @@ from striptools.measure.study import StudyOptions
 from striptools.measure.study_presorted import PAPER, presorted_of
 from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
+from striptools.options import Options
 from striptools.partition.object_split import split_objects
-from striptools.pipeline import Options
 from striptools.trace import Tracer
 from striptools.trace import presorted as layouts
 from striptools.trace.launch import program

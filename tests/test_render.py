@@ -12,7 +12,8 @@ from strategies import cube, sphere
 
 from striptools.errors import LimitError, MissingExtraError, UsageError, WriteError
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.rays import Camera

@@ -17,7 +17,7 @@ from striptools.errors import UsageError
 from striptools.kernels.rays import ROW
 from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.reducem.scene import empty_scene
 from striptools.strips.ordering import OrderingOptions
 from striptools.trace import Tracer

@@ -18,7 +18,8 @@ from striptools.mesh.attributes import Attribute, Material
 from striptools.mesh.clean import CleanOptions, clean
 from striptools.mesh.io import load_mesh, save_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert, convert_with_report
 from striptools.reducem import layout
 from striptools.reducem.attributes import (
     Column,

@@ -17,7 +17,8 @@ from striptools.mesh.io import save_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.simplify import SimplifyOptions, simplify
 from striptools.mesh.surface_distance import Surface, deviation
-from striptools.pipeline import Options, convert, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert, convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
 
 pytest.importorskip("fast_simplification")

@@ -16,7 +16,7 @@ from striptools.errors import MissingExtraError, UsageError
 from striptools.measure.plots import plot_study
 from striptools.measure.study import PAPER, Study, StudyOptions, paper_range, study_strips, variants
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions
 from striptools_cli.study import printed
 

@@ -17,8 +17,8 @@ from striptools.measure.hierarchy_cost import hierarchy_cost, presorted_regions
 from striptools.measure.quality import in_strip_tree
 from striptools.measure.study import StudyOptions
 from striptools.mesh.mesh import Mesh
+from striptools.options import Options
 from striptools.partition.sah import expected_cost
-from striptools.pipeline import Options
 from striptools.reducem.check_hierarchy import cells_of
 from striptools_cli.study import printed_tables
 

@@ -12,8 +12,8 @@ from striptools.hierarchies.slbvh import build_slbvh
 from striptools.measure.study import RAY_KINDS, StudyOptions, study_rays
 from striptools.measure.study_slbvh import study, tables
 from striptools.mesh.mesh import Mesh
+from striptools.options import Options
 from striptools.partition.boxes import range_boxes
-from striptools.pipeline import Options
 from striptools.trace import Tracer
 
 OPTIONS = StudyOptions(Options(threads=1), side=24, runs=1, device="cpu", threads=1)

@@ -19,7 +19,7 @@ from striptools.measure.trade_points import Setting, settings
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.reducem.quantize import PrecisionOptions
 from striptools_cli.trade import printed
 

@@ -12,7 +12,7 @@ from striptools.measure.report_html import sentences
 from striptools.measure.trade import Trade
 from striptools.measure.trade_points import chosen_by_targets, settings
 from striptools.measure.trade_targets import chosen_of
-from striptools.pipeline import Options
+from striptools.options import Options
 
 ROOT = Path(__file__).parent.parent
 REPORTS = ROOT / "samples" / "reports"

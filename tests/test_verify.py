@@ -17,7 +17,8 @@ from striptools.measure.structure import compare_structure
 from striptools.measure.verify import VerifyOptions, VerifyReport, verify
 from striptools.mesh.clean import CleanOptions, clean
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.scene import Remap, Scene
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits

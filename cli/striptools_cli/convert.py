@@ -23,8 +23,9 @@ from striptools.hierarchies.options import (
 from striptools.mesh.clean import RECENTRINGS, CleanOptions, Recentring, clean
 from striptools.mesh.io import WRITE_FORMATS, load_mesh, save_mesh, unkept
 from striptools.mesh.mesh import Mesh
+from striptools.options import Options, Report
 from striptools.partition.sah import SMALLEST_BLOCK
-from striptools.pipeline import Options, Report, convert_with_report
+from striptools.pipeline import convert_with_report
 from striptools.reducem.quantize import LEAST_BITS, MOST_BITS, PrecisionOptions
 from striptools.reducem.reader import read_scene
 from striptools.reducem.scene import BoxesKind, Scene

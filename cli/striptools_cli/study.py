@@ -13,7 +13,7 @@ from striptools.measure.study import Study, StudyOptions, StudyRow, paper_range,
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.stopwatch import Watch
 from striptools.strips.ordering import OrderingOptions
 from striptools_cli import log, notice

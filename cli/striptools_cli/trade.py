@@ -11,7 +11,7 @@ from striptools.measure.report_html import pictures_of, report_html, sentences, 
 from striptools.measure.trade import Point, Trade, TradeOptions, trade
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools_cli import log, notice
 from striptools_cli.options import Threads, format_option, from_option, quiet_option
 from striptools_cli.options_trace import Device, Up, runs_option, side_option

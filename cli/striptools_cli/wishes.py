@@ -6,7 +6,7 @@ from typing import cast
 from striptools.choose import Target, Wish, read_table
 from striptools.errors import UsageError
 from striptools.mesh.simplify import Simplified, SimplifyOptions
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools_cli.report import human_value
 
 _SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "B": 1, "": 1}

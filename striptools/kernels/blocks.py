@@ -59,7 +59,8 @@ def put(words, bit, value, width):
 def take(words, bit, width):
     """The number in `width` bits (0 to 32) from a bit on; reads one word more than it has to."""
     place = bit >> 5
-    wide = np.int64(words[place]) | np.int64(words[place + 1]) << 32
+    # An unsigned place is not compared with zero.
+    wide = np.int64(words[np.uint64(place)]) | np.int64(words[np.uint64(place + 1)]) << 32
     return wide >> (bit & 31) & ((1 << width) - 1)
 
 

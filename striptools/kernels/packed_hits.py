@@ -6,7 +6,7 @@ from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
-from striptools.kernels.wide import LEAST_NORMAL, WIDTH, first_corner
+from striptools.kernels.wide import LEAST_NORMAL, WIDTH
 
 
 @kernel
@@ -111,11 +111,12 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
 
 @inlined
 def bits_set(number):
-    """How many bits of a number below 2**32 are set."""
-    number -= number >> 1 & 0x55555555
-    number = (number & 0x33333333) + (number >> 2 & 0x33333333)
-    number = (number + (number >> 4)) & 0x0F0F0F0F
-    return number * 0x01010101 >> 24 & 0xFF
+    """How many bits of a number are set: written as LLVM knows it, which makes it one instruction."""
+    n = np.uint64(number)
+    n -= n >> np.uint64(1) & np.uint64(0x5555555555555555)
+    n = (n & np.uint64(0x3333333333333333)) + (n >> np.uint64(2) & np.uint64(0x3333333333333333))
+    n = n + (n >> np.uint64(4)) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64(n * np.uint64(0x0101010101010101) >> np.uint64(56))
 
 
 @inlined
@@ -144,15 +145,15 @@ def corner_indices(words, bit, counts, t):
     turn = turns >> max(size - 1, 0)
     other = turns ^ ((1 << size) - 1) * turn
     last = begin + highest_bit(other) if other != 0 else first
+
+    # Take the corners: without branches, which would go astray every other time.
     begin = bit + (2 + has_flips) * count + 2 * strip * width
     c = take(words, begin + (t + 2) * width, width)
     near = take(words, begin + (t + 1) * width, width)
-    if t == first:
-        a, b = take(words, begin + t * width, width), near
-    elif turn == 0:
-        a, b = near, take(words, begin + (last + 1) * width, width)
-    else:
-        a, b = take(words, begin + (first if last == first else last + 1) * width, width), near
+    at_first = (t == first) | ((turn == 1) & (last == first))
+    far = take(words, begin + (first if at_first else last + 1) * width, width)
+    near_is_a = (t != first) & (turn == 0)
+    a, b = near if near_is_a else far, far if near_is_a else near
     if has_flips and take(words, bit + 2 * count + t, 1):
         a, b = b, a
     return a, b, c
@@ -165,51 +166,102 @@ def power_of_two(exponent):
 
 
 @inlined
-def scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, corners):
-    """Fill corners (3, 3) float32, a row each, with three of a block's vertices times 2**scale_exponent.
+def coordinate(number, mode, width, anchor, exponent, scale_exponent):
+    """A coordinate of any mode from its number, times 2**scale_exponent: zero where that is not normal."""
+    whole = number + anchor
+    size = abs(whole)
+    unit = power_of_two(exponent + scale_exponent)
+    if mode == 2:
+        # Take the bits of the float apart.
+        bits = whole if whole >= 0 else -1 - whole
+        field = bits >> 23
+        size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
+        unit = power_of_two(max(field, 1) - 150 + scale_exponent)
+    elif mode == 1 and number == (1 << width) - 1:
+        size = np.int64(0)
+    exact = np.float64(size) * unit
+    value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
+    return -value if whole < 0 else value
 
-    What is not a normal number then is zero, as the walks have it.
+
+@kernel
+def decode_triangles(headers, words, names, count, scale_exponent, places, corners, turns):
+    """Decode up to 64 triangles, step by step, so that one waits for memory while others do.
+
+    Corners are times 2**scale_exponent, what is not a normal number then is zero, as the walks have it.
+
+    Args:
+        headers: (b, 8) uint32.
+        words: (w,) uint32.
+        names: (64,) int64, 256 times a triangle's block plus its number there.
+        count: How many triangles.
+        scale_exponent: Of the power of two that positions are multiplied by.
+        places: (3, 64) int64, room.
+        corners: (9, 64) float32, written: x of corners a, b and c, in the order of the tests, then y, then z.
+        turns: (64,) int32, written: the strip's corner that is the first in the order of the tests.
     """
-    count, _, strips, has_flips, index_width = counts
-    begin = bit + (2 + has_flips) * count + (count + 2 * strips) * index_width
-    stride = axis_of(headers, block, 0)[1] + axis_of(headers, block, 1)[1] + axis_of(headers, block, 2)[1]
-    for axis in range(3):
-        mode, width, anchor, exponent = axis_of(headers, block, axis)
-        if mode == 0 and exponent + scale_exponent >= -126:
-            # Integers of at most 24 bits and a normal power of two: float32 is exact.
-            power = np.int32((exponent + scale_exponent + 127) << 23).view(np.float32)
-            for j in range(3):
-                whole = take(words, begin + indices[j] * stride, width) + anchor
-                corners[j, axis] = np.float32(whole) * power
+    # Find where each corner's bits begin.
+    for i in range(count):
+        block = names[i] >> 8
+        bit = np.int64(headers[block, 1]) << 5
+        counts = block_counts(headers, block)
+        a, b, c = corner_indices(words, bit, counts, names[i] & 255)
+        triangles, _, strips, has_flips, index_width = counts
+        begin = bit + (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
+        packed = np.int64(headers[block, 6])
+        stride = (packed & 63) + (packed >> 8 & 63) + (packed >> 16 & 63)
+        places[0, i] = begin + a * stride
+        places[1, i] = begin + b * stride
+        places[2, i] = begin + c * stride
+
+    # Take them.
+    for i in range(count):
+        block = names[i] >> 8
+        begin = np.int64(0)
+        for axis in range(3):
+            mode, width, anchor, exponent = axis_of(headers, block, axis)
+            if mode == 0 and exponent + scale_exponent >= -126:
+                # Integers of at most 24 bits and a normal power of two: float32 is exact.
+                power = np.int32((exponent + scale_exponent + 127) << 23).view(np.float32)
+                for j in range(3):
+                    whole = take(words, places[j, i] + begin, width) + anchor
+                    corners[3 * axis + j, i] = np.float32(whole) * power
+            else:
+                for j in range(3):
+                    number = take(words, places[j, i] + begin, width)
+                    corners[3 * axis + j, i] = coordinate(
+                        number, mode, width, anchor, exponent, scale_exponent
+                    )
             begin += width
-            continue
-        unit = power_of_two(exponent + scale_exponent)
-        for j in range(3):
-            number = take(words, begin + indices[j] * stride, width)
-            whole = number + anchor
-            size = abs(whole)
-            if mode == 2:
-                # Take the bits of the float apart.
-                bits = whole if whole >= 0 else -1 - whole
-                field = bits >> 23
-                size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
-                unit = power_of_two(max(field, 1) - 150 + scale_exponent)
-            elif mode == 1 and number == (1 << width) - 1:
-                size = np.int64(0)
-            exact = np.float64(size) * unit
-            value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
-            corners[j, axis] = -value if whole < 0 else value
-        begin += width
+
+    # Turn them.
+    for i in range(len(turns)):
+        x0, x1, x2 = corners[0, i], corners[1, i], corners[2, i]
+        y0, y1, y2 = corners[3, i], corners[4, i], corners[5, i]
+        z0, z1, z2 = corners[6, i], corners[7, i], corners[8, i]
+        second = precedes(x1, y1, z1, x0, y0, z0)
+        third = precedes(x2, y2, z2, x1, y1, z1) if second else precedes(x2, y2, z2, x0, y0, z0)
+        corners[0, i], corners[1, i], corners[2, i] = turned(x0, x1, x2, second, third)
+        corners[3, i], corners[4, i], corners[5, i] = turned(y0, y1, y2, second, third)
+        corners[6, i], corners[7, i], corners[8, i] = turned(z0, z1, z2, second, third)
+        turns[i] = np.int32(2) if third else (np.int32(1) if second else np.int32(0))
 
 
 @inlined
-def turned_corners(headers, words, block, number, scale_exponent, corners):
-    """Fill corners, as `scaled_corners` does, with a triangle of a block; returns the first of the order."""
-    bit = np.int64(headers[block, 1]) << 5
-    counts = block_counts(headers, block)
-    indices = corner_indices(words, bit, counts, number)
-    scaled_corners(headers, words, block, bit, counts, indices, scale_exponent, corners)
-    return np.int64(first_corner(corners))
+def precedes(x, y, z, other_x, other_y, other_z):
+    """Whether one corner is smaller than another by x, then y, then z."""
+    below = (y < other_y) | ((y == other_y) & (z < other_z))
+    return (x < other_x) | ((x == other_x) & below)
+
+
+@inlined
+def turned(a, b, c, second, third):
+    """Three corners from the second or from the third one on."""
+    return (
+        c if third else (b if second else a),
+        a if third else (c if second else b),
+        b if third else (a if second else c),
+    )
 
 
 @kernel
@@ -252,41 +304,46 @@ def weigh_packed_hits(
         triangle: (r,) int32, written; -1 on a miss.
     """
     weighed = len(u) > 0
-    decoded = np.zeros((3, 3), np.float32)
     room = np.zeros(ROOM, np.float32)
+    corners = np.zeros((9, CHUNK), np.float32)
+    places = np.zeros((3, CHUNK), np.int64)
+    names = np.zeros(CHUNK, np.int64)
+    turns = np.zeros(CHUNK, np.int32)
     ray_of = np.zeros(CHUNK, np.int32)
+    slot_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
-    held = 0
-    last, turn = np.int64(-1), np.int64(0)
+    held, distinct = 0, 0
     for k in range(len(at)):
         r = at[k]
         if r >= 0:
             t[r] = found_t[k]
-            block = np.int64(found[k]) >> 8
+            name = np.int64(found[k])
             number = np.int64(-1)
             face[r] = found[k]
-            if block >= 0:
-                number = np.int64(headers[block, 0]) + (np.int64(found[k]) & 255)
+            if name >= 0:
+                number = np.int64(headers[name >> 8, 0]) + (name & 255)
                 face[r] = faces[number] if len(faces) > 0 else number
             triangle[r] = number
-            if weighed and block < 0:
+            if weighed and name < 0:
                 u[r] = 0.0
                 v[r] = 0.0
             elif weighed:
-                # Decode the triangle, unless it was hit just before, and turn it as the tests do.
-                if number != last:
-                    own = np.int64(found[k]) & 255
-                    last, turn = number, turned_corners(headers, words, block, own, scale_exponent, decoded)
-                axes = take_ray(origins, directions, r, room, held)
-                for axis in range(3):
-                    for j in range(3):
-                        corner = decoded[(j + turn) % 3, axes[axis]]
-                        room[CORNERS + (3 * axis + j) * CHUNK + held] = corner
-
-                # Name its corners as the reported face does.
+                # A triangle that was hit just before is decoded once.
+                distinct += 1 if held == 0 or names[max(distinct - 1, 0)] != name else 0
+                names[distinct - 1] = name
+                slot_of[held] = distinct - 1
                 ray_of[held] = r
-                turn_of[held] = (turn + rotations[number]) % 3 if len(rotations) > 0 else turn
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
+            decode_triangles(headers, words, names, distinct, scale_exponent, places, corners, turns)
+            for i in range(held):
+                r, slot = ray_of[i], slot_of[i]
+                axes = take_ray(origins, directions, r, room, i)
+                for axis in range(3):
+                    for j in range(3):
+                        room[CORNERS + (3 * axis + j) * CHUNK + i] = corners[3 * axes[axis] + j, slot]
+                # Name its corners as the reported face does.
+                rotation = rotations[triangle[r]] if len(rotations) > 0 else 0
+                turn_of[i] = (turns[slot] + rotation) % 3
             weigh_held(room, held, scale, ray_of, turn_of, u, v)
-            held = 0
+            held, distinct = 0, 0

@@ -121,6 +121,7 @@ def weigh_hits(
     room = np.zeros(ROOM, np.float32)
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
+    slot_of = np.zeros(CHUNK, np.int32)
     held = 0
     for k in range(len(at)):
         r = at[k]
@@ -133,16 +134,19 @@ def weigh_hits(
                 u[r] = 0.0
                 v[r] = 0.0
             elif weighed:
-                slot = place[name]
-                kx, ky, kz = take_ray(origins, directions, r, room, held)
-                block, lane = slot >> 5, (slot >> 2) & 7
-                for j in range(3):
-                    room[CORNERS + j * CHUNK + held] = blocks[block, 3 * kx + j, lane]
-                    room[CORNERS + (3 + j) * CHUNK + held] = blocks[block, 3 * ky + j, lane]
-                    room[CORNERS + (6 + j) * CHUNK + held] = blocks[block, 3 * kz + j, lane]
                 ray_of[held] = r
-                turn_of[held] = slot & 3
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
+            # Step by step, so that one waits for memory while others do.
+            for i in range(held):
+                slot_of[i] = place[face[ray_of[i]]]
+            for i in range(held):
+                kx, ky, kz = take_ray(origins, directions, ray_of[i], room, i)
+                block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
+                for j in range(3):
+                    room[CORNERS + j * CHUNK + i] = blocks[block, 3 * kx + j, lane]
+                    room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
+                    room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
+                turn_of[i] = slot_of[i] & 3
             weigh_held(room, held, scale, ray_of, turn_of, u, v)
             held = 0

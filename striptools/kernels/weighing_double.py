@@ -3,8 +3,9 @@
 import numpy as np
 
 from striptools.kernels.compiled import kernel
-from striptools.kernels.packed_hits import turned_corners
+from striptools.kernels.packed_hits import decode_triangles
 from striptools.kernels.packets import longest_axis
+from striptools.kernels.weighing import CHUNK
 from striptools.kernels.wide import flushed
 
 
@@ -40,15 +41,20 @@ def packed_corners(names, headers, words, rotations, scale_exponent, corners, tu
         corners: (k, 3, 3) float32, written: a row an axis, a column a corner, in the order of the tests.
         turns: (k,) int32, written: corner j is the reported face's (j + turn) % 3.
     """
-    decoded = np.zeros((3, 3), np.float32)
-    for k in range(len(names)):
-        block, number = np.int64(names[k]) >> 8, np.int64(names[k]) & 255
-        turn = turned_corners(headers, words, block, number, scale_exponent, decoded)
-        for axis in range(3):
-            for j in range(3):
-                corners[k, axis, j] = decoded[(j + turn) % 3, axis]
-        turned = rotations[np.int64(headers[block, 0]) + number] if len(rotations) > 0 else 0
-        turns[k] = (turn + turned) % 3
+    decoded = np.zeros((9, CHUNK), np.float32)
+    places = np.zeros((3, CHUNK), np.int64)
+    wanted = np.zeros(CHUNK, np.int64)
+    turned = np.zeros(CHUNK, np.int32)
+    for begin in range(0, len(names), CHUNK):
+        count = min(CHUNK, len(names) - begin)
+        wanted[:count] = names[begin : begin + count]
+        decode_triangles(headers, words, wanted, count, scale_exponent, places, decoded, turned)
+        for i in range(count):
+            for row in range(9):
+                corners[begin + i, row // 3, row % 3] = decoded[row, i]
+            number = np.int64(headers[wanted[i] >> 8, 0]) + (wanted[i] & 255)
+            rotation = rotations[number] if len(rotations) > 0 else 0
+            turns[begin + i] = (turned[i] + rotation) % 3
 
 
 @kernel

@@ -25,7 +25,8 @@ from striptools.measure.study import tell_no_one
 from striptools.measure.verify import VerifyOptions, verify
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch

@@ -30,7 +30,8 @@ from striptools.measure.judgement import Judge, compare_reported
 from striptools.measure.oracle import Oracle
 from striptools.measure.ray_sets import RaySet
 from striptools.mesh.io import READ_FORMATS, load_mesh
-from striptools.pipeline import Options, Report, convert_with_report
+from striptools.options import Options, Report
+from striptools.pipeline import convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Remap, Scene
 from striptools.trace import Tracer

@@ -28,7 +28,8 @@ import numpy as np
 from striptools.errors import UsageError
 from striptools.measure.quality import StripQuality, full_tree_cost, strip_quality, traversal_steps
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert_with_report
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch
 from striptools.strips.ordering import LARGEST_LENGTH, OrderingOptions

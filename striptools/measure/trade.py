@@ -56,7 +56,8 @@ from striptools.mesh.clean import clean
 from striptools.mesh.mesh import Mesh
 from striptools.mesh.simplify import collapsed
 from striptools.mesh.surface_distance import Surface, deviation
-from striptools.pipeline import Options, convert_with_report
+from striptools.options import Options
+from striptools.pipeline import convert_with_report
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Scene
 from striptools.stopwatch import Watch

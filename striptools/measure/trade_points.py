@@ -12,7 +12,7 @@ from typing import get_args
 
 from striptools.choose import BASELINE, BOX_PRECISION, PAIR, TARGET, TARGETS, TRACED, for_target
 from striptools.hierarchies.options import HierarchyName, HierarchyOptions
-from striptools.pipeline import Options
+from striptools.options import Options
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.resident import Residency
 from striptools.trace.tracer import HierarchyKind

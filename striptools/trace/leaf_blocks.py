@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from striptools.trace.triangle import Corners, Shear
-from striptools.trace.walk import NO_NAME, WIDTH, Best, Leaf, replaced
+from striptools.trace.walk import NO_NAME, WIDTH, Best, Leaf, nearer
 from striptools.types import TriangleTest
 
 
 def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: TriangleTest) -> Best:
-    """Test the triangles of a block, each lane against its own closest hit.
+    """Test the triangles of a block, against the closest hit so far.
 
     Args:
         blocks: (l, 10, 8) float32, rows of x, y and z of corners a, b and c, then the bits of faces.
@@ -24,8 +24,7 @@ def test_block(blocks: Array, block: Array, shear: Shear, best: Best, test: Tria
     """
     leaf = leaf_in(blocks, block, shear.axes)
     t = leaf.crossings(shear, test=test, again=lambda: leaf_in(blocks, block, shear.axes))
-    closer = (t > 0) & ((t < best.t) | ((t == best.t) & (leaf.name < best.name)))
-    return replaced(best, closer, t, leaf.name)
+    return nearer(best, t, leaf.name)
 
 
 def leaf_in(blocks: Array, block: Array, axes: tuple[Array, Array, Array]) -> Leaf:

@@ -11,7 +11,7 @@ Differences:
 1. A few rays go side by side in one instruction stream, so that one's arithmetic fills the other's waits:
    two on a CPU, one on a GPU. A ray that has reached a leaf, or its end, waits while another is at inner
    nodes.
-2. Leaves are tested eight triangles at once, each lane keeping its own closest hit until the walk ends.
+2. Leaves are tested eight triangles at once; hits are looked at one by one only where there are any.
 3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
    the same t the one of the smaller face is kept: the result does not depend on the order of visits.
 
@@ -97,10 +97,9 @@ class Frame(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The closest hit of all, or t_max, and that in each lane, (8,): `name` is what the scene calls it."""
+    """The closest hit: its t, or t_max, and what the scene calls the triangle, or `MISS`; () each."""
 
     nearest: Array
-    t: Array
     name: Array
 
 
@@ -187,16 +186,20 @@ class WalkScene(Protocol):
         """
         ...
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: "Decode | None") -> Leaf:
-        """The triangles of a leaf, their corners along these axes."""
+    def find_leaf(self, child: Array) -> Any:
+        """Where the triangles of a leaf are; anything where the child is none."""
         ...
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: "WalkOptions") -> Best:
-        """Test the triangles of a leaf, each lane against its own closest hit."""
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: Any, decode: "Decode | None") -> Leaf:
+        """The triangles of a leaf that `find_leaf` found, their corners along these axes."""
         ...
 
-    def triangles_of(self, child: Array) -> Array:
-        """() int32: how many triangles a leaf has; anything where the child is none."""
+    def visit_leaf(self, shear: Shear, where: Any, best: Best, options: "WalkOptions") -> Best:
+        """Test the triangles of a leaf, against the closest hit so far."""
+        ...
+
+    def triangles_of(self, where: Any) -> Array:
+        """() int32: how many triangles a leaf has; anything where there is none."""
         ...
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
@@ -501,37 +504,52 @@ def _visit_node(
     return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
 
 
-def replaced(best: Best, closer: Array, t: Array, name: Array) -> Best:
-    """The closest hits where `closer` says in which lanes new ones take their place."""
-    t = jnp.where(closer, t, best.t)
-    return Best(folded(t, smaller), t, jnp.where(closer, name, best.name))
+def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array] | None = None) -> Best:
+    """The closest hit, with those on eight triangles; of hits at the same t that of the least face.
+
+    Args:
+        best: So far.
+        t: (8,) float32, positive and finite only where there is a hit.
+        name: (8,) int32.
+        faces_of: Where names are not faces, the faces of (8,) names.
+    """
+    hit = (t > 0) & (t <= best.nearest)
+
+    def replace() -> Best:
+        nearest = folded(jnp.where(hit, t, np.float32(jnp.inf)), smaller)
+        names = jnp.where(t == nearest, name, NO_NAME)
+        least = folded(names, smaller)
+        new = (nearest < best.nearest) | (least < best.name)
+        if faces_of is not None:
+            least, new = _first_by_face(faces_of, names, least, nearest, best)
+        return Best(nearest, jnp.where(new, least, best.name))
+
+    return lax.cond(any_lane(hit), replace, lambda: best)
+
+
+def _first_by_face(
+    faces_of: Callable[[Array], Array], names: Array, least: Array, nearest: Array, best: Best
+) -> tuple[Array, Array]:
+    """Of names the one of the least face, and whether it takes the place of what was found before.
+
+    Faces are read only where there are two hits at the same t.
+    """
+
+    def by_face() -> tuple[Array, Array]:
+        faces = jnp.where(names == NO_NAME, NO_NAME, faces_of(jnp.where(names == NO_NAME, 0, names)))
+        face = folded(faces, smaller)
+        first = folded(jnp.where(faces == face, names, NO_NAME), smaller)
+        before = faces_of(jnp.full(WIDTH, best.name))[0]
+        return first, (nearest < best.nearest) | (face < before)
+
+    several = folded(jnp.where(names == NO_NAME, jnp.int32(0), jnp.int32(1)), jnp.add) > 1
+    return lax.cond(several | (nearest == best.nearest), by_face, lambda: (least, jnp.bool_(True)))
 
 
 def found_any(best: Best, t: Array) -> Best:
     """What any hit has found, with t of eight triangles: once it is something, `nearest` is zero."""
-    hit = (t > 0) & (t < best.t)
+    hit = (t > 0) & (t < best.nearest)
     return best._replace(nearest=jnp.where(any_lane(hit), np.float32(0), best.nearest))
-
-
-def closest_name(best: Best, scene: WalkScene | None = None) -> Array:
-    """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
-
-    Args:
-        best: In each lane.
-        scene: Where names are not faces.
-    """
-    held = (best.t == best.nearest) & (best.name >= 0)
-    names = jnp.where(held, best.name, NO_NAME)
-    least = folded(names, smaller)
-    if scene is not None and scene.has_faces:
-        several = folded(jnp.where(held, jnp.int32(1), jnp.int32(0)), jnp.add) > 1
-        least = lax.cond(several, lambda: _name_of_least(scene, names), lambda: least)
-    return jnp.where(least == NO_NAME, MISS, least)
-
-
-def _name_of_least(scene: WalkScene, names: Array) -> Array:
-    faces = jnp.where(names == NO_NAME, NO_NAME, scene.faces_of(names))
-    return folded(jnp.where(faces == folded(faces, smaller), names, NO_NAME), smaller)
 
 
 class _Walked(NamedTuple):
@@ -582,10 +600,12 @@ class _Walk:
     def visit_leaves(self, state: _State, bests: tuple[Found, ...]) -> tuple[_State, tuple[Found, ...]]:
         """Each ray that is at a leaf tests it and goes on."""
         at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
+        # Found for all rays at once: one's loads go on while another's are waited for.
+        where = [self.scene.find_leaf(place.child) for place in state.places]
         after = [
             lax.cond(
                 at_leaf[k],
-                partial(self.leave_leaf, k, state, bests[k]),
+                partial(self.leave_leaf, k, state, bests[k], where[k]),
                 partial(self.stay, k, state, bests[k]),
             )
             for k in range(len(self.rays))
@@ -593,19 +613,19 @@ class _Walk:
         visits = self.count(state.visits, at_leaf, _A_LEAF)
         if visits:
             tested = [
-                jnp.where(there, self.scene.triangles_of(place.child), 0)
-                for there, place in zip(at_leaf, state.places, strict=True)
+                jnp.where(there, self.scene.triangles_of(leaf), 0)
+                for there, leaf in zip(at_leaf, where, strict=True)
             ]
             visits = tuple(each + _A_TRIANGLE * count for each, count in zip(visits, tested, strict=True))
         return state._replace(places=tuple(a[0] for a in after), visits=visits), tuple(a[1] for a in after)
 
-    def leave_leaf(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
+    def leave_leaf(self, k: int, state: _State, best: Found, where: Any) -> tuple[Place, Found]:
         """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
         ray, place = self.rays[k], state.places[k]
         if isinstance(best, Gathered):
-            best = gather_leaf(self.scene, ray.shear, ray.t_max, place.child, best, self.options)
+            best = gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
         else:
-            best = self.scene.visit_leaf(ray.shear, place.child, best, self.options)
+            best = self.scene.visit_leaf(ray.shear, where, best, self.options)
         there = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
@@ -699,7 +719,7 @@ def _nothing_found(ray: ReadyRay, options: WalkOptions) -> Found:
     """What a walk has found before it starts."""
     if options.gather is not None:
         return nothing_gathered(ray.t_max, options.most)
-    return Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32))
+    return Best(ray.t_max, jnp.int32(MISS))
 
 
 def _result(
@@ -712,6 +732,6 @@ def _result(
         t, name = best.nearest, jnp.where(best.nearest < ray.t_max, HIT, MISS)
         count = jnp.zeros(0, jnp.int32)
     else:
-        t, name, count = best.nearest, closest_name(best, scene), jnp.zeros(0, jnp.int32)
+        t, name, count = best.nearest, best.name, jnp.zeros(0, jnp.int32)
     t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(t * ray.t_unit))
     return t, jnp.where(place.child != DONE, STUCK, name), count

@@ -7,7 +7,7 @@ Counting leaves out nothing before t_max. Cost: of each hit found, a move for ev
 copy of what is kept at each leaf.
 """
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -52,10 +52,10 @@ def nothing_gathered(t_max: Array, most: int) -> Gathered:
 
 
 def gather_leaf(
-    scene: "WalkScene", shear: Shear, t_max: Array, child: Array, so_far: Gathered, options: "WalkOptions"
+    scene: "WalkScene", shear: Shear, t_max: Array, where: Any, so_far: Gathered, options: "WalkOptions"
 ) -> Gathered:
     """Add the triangles of a leaf."""
-    leaf = scene.leaf_of(shear.axes, child, options.decode)
+    leaf = scene.leaf_of(shear.axes, where, options.decode)
     if options.gather == "windings":
         return _counted(so_far, _windings(leaf, shear))
     t = leaf.crossings(shear, test=options.test)

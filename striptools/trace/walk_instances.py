@@ -153,13 +153,17 @@ class _Seen(NamedTuple):
         bits = lax.dynamic_slice(self.scene.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
         return lax.bitcast_convert_type(bits, jnp.int32)
 
-    def triangles_of(self, child: Array) -> Array:
+    def find_leaf(self, child: Array) -> Array:
+        """The child."""
+        return child
+
+    def triangles_of(self, where: Array) -> Array:
         """Triangles are counted in the geometries."""
         return jnp.int32(0)
 
-    def visit_leaf(self, shear: Shear, child: Array, best: _Nearest, options: WalkOptions) -> _Nearest:
+    def visit_leaf(self, shear: Shear, where: Array, best: _Nearest, options: WalkOptions) -> _Nearest:
         """Walk the geometry of an instance."""
-        number = -(child + 1)
+        number = -(where + 1)
         at = index(number)
         matrix = lax.dynamic_slice(self.scene.matrices, (at, jnp.uint32(0), jnp.uint32(0)), (1, 3, 4))[0]
         origin, direction = moved(matrix, self.origin, self.direction)
@@ -169,7 +173,7 @@ class _Seen(NamedTuple):
         # Once there is a hit, one just as near may be of an instance before it.
         limit = jnp.where(best.instance >= 0, _next_above(best.nearest), best.nearest)
         # A GPU goes through the motions for rays that are at no leaf.
-        there = (child < 0) & (child != DONE)
+        there = (where < 0) & (where != DONE)
         row = prepared_ray(seen, origin, direction, jnp.where(there, limit, 0), _at(self.scene.roots, at))
         end = walk_alone(seen, row, options)
         t, name = found_alone(seen, end, options.any_hit)

@@ -26,7 +26,7 @@ from striptools.trace.box import FAR_FACTOR
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import folded, index, larger, smaller
 from striptools.trace.triangle import crossing_of, edges_of
-from striptools.trace.walk import MISS, SLACK, WIDTH, Best, Frame, ReadyRay, Traced, WalkOptions
+from striptools.trace.walk import SLACK, Best, Frame, ReadyRay, Traced, WalkOptions
 from striptools.trace.walk_single import (
     Ended,
     Leaves,
@@ -40,9 +40,6 @@ from striptools.trace.walk_single import (
 LEAF = 3
 NODE_BYTES, REFERENCE_BYTES, TRIANGLE_BYTES = 8, 4, 40
 
-Found = tuple[Array, ...]
-"""What a ray has found: as few numbers as the kind of objects needs."""
-
 
 class Triangles(NamedTuple):
     """Objects that are triangles.
@@ -53,11 +50,7 @@ class Triangles(NamedTuple):
 
     rows: Any
 
-    def nothing(self, ray: ReadyRay) -> Found:
-        """T and face before the walk."""
-        return ray.t_max, jnp.int32(MISS)
-
-    def test(self, ray: ReadyRay, which: Array, found: Found) -> Found:
+    def test(self, ray: ReadyRay, which: Array, best: Best) -> Best:
         """Test a triangle."""
 
         def corners(axis: Array) -> tuple[Array, Array, Array]:
@@ -68,17 +61,12 @@ class Triangles(NamedTuple):
         t = crossing_of(edges_of(x, y, z, ray.shear))
         row = lax.dynamic_slice(self.rows, (which, jnp.uint32(9)), (1, 1))[0]
         face = lax.bitcast_convert_type(row[0], jnp.int32)
-        closer = (t > 0) & ((t < found[0]) | ((t == found[0]) & (face < found[1])))
-        return jnp.where(closer, t, found[0]), jnp.where(closer, face, found[1])
+        closer = (t > 0) & ((t < best.nearest) | ((t == best.nearest) & (face < best.name)))
+        return Best(jnp.where(closer, t, best.nearest), jnp.where(closer, face, best.name))
 
     def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return jnp.ones_like(which, jnp.int32)
-
-    def best(self, found: Found) -> Best:
-        """What was found, as all walks give it."""
-        name = jnp.where(jnp.arange(WIDTH) == 0, found[1], MISS)
-        return Best(found[0], jnp.full(WIDTH, found[0]), name)
 
 
 class Strips(NamedTuple):
@@ -90,21 +78,13 @@ class Strips(NamedTuple):
 
     leaves: Leaves
 
-    def nothing(self, ray: ReadyRay) -> Found:
-        """Nearest, t and name by lane before the walk."""
-        return tuple(nothing_yet(ray))
-
-    def test(self, ray: ReadyRay, which: Array, found: Found) -> Found:
+    def test(self, ray: ReadyRay, which: Array, best: Best) -> Best:
         """Test the triangles of a strip."""
-        return tuple(test_leaf(self.leaves, which, ray, Best(*found)))
+        return test_leaf(self.leaves, which, ray, best)
 
     def size(self, which: Array) -> Array:
         """How many triangles an object has."""
         return triangles_in_leaf(self.leaves, which)
-
-    def best(self, found: Found) -> Best:
-        """What was found, as all walks give it."""
-        return Best(*found)
 
 
 class KdScene(NamedTuple):
@@ -162,7 +142,7 @@ def _walk(scene: KdScene, ray: ReadyRay, stack: Array, options: WalkOptions) -> 
     entry, leave = _through_root(scene, ray)
     live = is_live(ray) & (entry <= smaller(leave, ray.t_max * SLACK))
     place = _Place(zero, entry, leave, jnp.where(live, zero, -1), zero)
-    found = scene.things.nothing(ray)
+    best = nothing_yet(ray)
     mail = _Mail(scene.mailbox, zero, zero)
     visits = _Visits(zero, zero)
     bound = 2 * scene.nodes.shape[0]
@@ -172,27 +152,27 @@ def _walk(scene: KdScene, ray: ReadyRay, stack: Array, options: WalkOptions) -> 
         return (place.height >= 0) & (place.turns <= bound)
 
     def to_next_leaf(carried: Any) -> Any:
-        place, stack, found, mail, visits = carried
-        limit = found[0] * SLACK
+        place, stack, best, mail, visits = carried
+        limit = best.nearest * SLACK
         place, stack = lax.while_loop(
             lambda s: (_word(scene.nodes, s[0].node, 1) & 3 != LEAF) & (s[0].turns <= bound),
             lambda s: _step(scene, ray, s[0], s[1], limit),
             (place, stack),
         )
         first, count = _word(scene.nodes, place.node, 0), _word(scene.nodes, place.node, 1) >> 2
-        found, mail = _visit_leaf(scene, ray, first, count, found, mail, options)
+        best, mail = _visit_leaf(scene, ray, first, count, best, mail, options)
         if options.counting:
             visits = _Visits(visits.leaves + 1, visits.references + count)
-        place = _popped(place, stack, found[0] * SLACK)
+        place = _popped(place, stack, best.nearest * SLACK)
         if options.any_hit:
-            place = place._replace(height=jnp.where(found[0] < ray.t_max, -1, place.height))
-        return place, stack, found, mail, visits
+            place = place._replace(height=jnp.where(best.nearest < ray.t_max, -1, place.height))
+        return place, stack, best, mail, visits
 
-    place, stack, found, mail, visits = lax.while_loop(
-        goes_on, to_next_leaf, (place, stack, found, mail, visits)
+    place, stack, best, mail, visits = lax.while_loop(
+        goes_on, to_next_leaf, (place, stack, best, mail, visits)
     )
     counters = _counters(place, mail, visits)
-    return stack, Ended(scene.things.best(found), counters, place.height >= 0)
+    return stack, Ended(best, counters, place.height >= 0)
 
 
 def _through_root(scene: KdScene, ray: ReadyRay) -> tuple[Array, Array]:
@@ -242,27 +222,27 @@ def _visit_leaf(
     ray: ReadyRay,
     first: Array,
     count: Array,
-    found: Found,
+    best: Best,
     mail: _Mail,
     options: WalkOptions,
-) -> tuple[Found, _Mail]:
+) -> tuple[Best, _Mail]:
     """Test the objects of a leaf that the mail-box does not know."""
     end = first + count
 
-    def test(carried: tuple[Array, Found, _Mail]) -> tuple[Array, Found, _Mail]:
-        place, found, mail = carried
+    def test(carried: tuple[Array, Best, _Mail]) -> tuple[Array, Best, _Mail]:
+        place, best, mail = carried
         which = lax.dynamic_slice(scene.references, (index(place),), (1,))[0]
         if scene.mailbox.shape[0] == 0:
-            return place + 1, *_test_object(scene, ray, which, found, mail, options)
+            return place + 1, *_test_object(scene, ray, which, best, mail, options)
         known = _knows(mail.objects, which)
-        found, mail = lax.cond(
+        best, mail = lax.cond(
             known,
-            lambda: (found, mail),
-            lambda: _test_object(scene, ray, which, found, mail, options),
+            lambda: (best, mail),
+            lambda: _test_object(scene, ray, which, best, mail, options),
         )
-        return place + 1, found, mail
+        return place + 1, best, mail
 
-    return lax.while_loop(lambda carried: carried[0] < end, test, (first, found, mail))[1:]
+    return lax.while_loop(lambda carried: carried[0] < end, test, (first, best, mail))[1:]
 
 
 def _knows(mailbox: Array, which: Array) -> Array:
@@ -271,10 +251,10 @@ def _knows(mailbox: Array, which: Array) -> Array:
 
 
 def _test_object(
-    scene: KdScene, ray: ReadyRay, which: Array, found: Found, mail: _Mail, options: WalkOptions
-) -> tuple[Found, _Mail]:
+    scene: KdScene, ray: ReadyRay, which: Array, best: Best, mail: _Mail, options: WalkOptions
+) -> tuple[Best, _Mail]:
     """Test an object and put it into the mail-box, in the place of the one that is longest there."""
-    found = scene.things.test(ray, index(which), found)
+    best = scene.things.test(ray, index(which), best)
     size = scene.mailbox.shape[0]
     if size > 0:
         oldest = mail.tested & (size - 1)
@@ -282,7 +262,7 @@ def _test_object(
         mail = mail._replace(objects=objects, tested=mail.tested + 1)
     if options.counting:
         mail = mail._replace(triangles=mail.triangles + scene.things.size(index(which)))
-    return found, mail
+    return best, mail
 
 
 def _popped(place: _Place, stack: Array, limit: Array) -> _Place:

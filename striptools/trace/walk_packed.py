@@ -36,7 +36,7 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import any_lane, index
+from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
@@ -47,7 +47,7 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     found_any,
-    replaced,
+    nearer,
     walk_rays,
 )
 from striptools.trace.walk_packets import walk_packets
@@ -179,54 +179,66 @@ class PackedScene(NamedTuple):
         # The bottom of a stack has a lane that no node has.
         return jnp.where(lane > 7, DONE, child)
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def find_leaf(self, child: Array) -> "_Run":
+        """The run of a leaf; some run where the child is none."""
+        return self._run_of(jnp.where((child < 0) & (child != DONE), child, -1))
+
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None) -> Leaf:
         """The triangles of a run, decoded, their corners along these axes."""
-        x, y, z, filled, name = self._decoded(child, decode, self._whole_row)
-        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
-        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
-
-    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
-        """The same, decoded once: behind a cond, or XLA decodes it anew for every use and for every axis."""
-        shape = jnp.zeros(LANES)
-        nothing = ([shape] * 3,) * 3
-        x, y, z, filled, name = lax.cond(
-            child < 0,
-            lambda: self._decoded(child, decode, self._once),
-            lambda: (*nothing, jnp.zeros(LANES, jnp.bool_), jnp.zeros(LANES, jnp.int32)),
-        )
-        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
-        return Leaf(ax, ay, az, _first_corner(x, y, z), filled, name)
-
-    def _decoded(
-        self, child: Array, decode: Decode | None, header_at: Callable[[Array, Array], Any]
-    ) -> tuple[list[Array], list[Array], list[Array], Array, Array]:
-        """Coordinates x, y, z of corners a, b, c, which lanes hold a triangle, and their names."""
         assert decode is not None
-        # Behind barriers, or XLA finds the run anew for every use of it.
-        block, run = self._settled(self._run_of(child))
-        header = self._settled(header_at(self.headers, block))
-        lane = self._lanes()
-        corners = self._corners(header, run, decode.flips)
-        x, y, z = self._positions(header, corners, decode)
-        name = (block << 8 | ((run & 0xFF) + lane)).astype(jnp.int32)
-        return x, y, z, lane <= (run >> 8 & 7), name
+        # Behind a barrier, or XLA reads it anew for every use of it.
+        header = self._settled(self._whole_row(self.headers, where.block))
+        x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
+        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
+        return Leaf(ax, ay, az, _first_corner(x, y, z), *self._named(where))
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
-        """Decode the triangles of a run and test them, each lane against its own closest hit."""
+    def leaf_for_packets(
+        self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None
+    ) -> Leaf:
+        """The same, decoded once: behind a cond, or XLA decodes it anew for every use.
+
+        What an axis needs is chosen, not what it gives: a few numbers in the place of lanes.
+        """
+        assert decode is not None
+        nothing = ([jnp.zeros(LANES)] * 3,) * 3
+
+        def decoded() -> tuple[list[Array], ...]:
+            header = self._settled(self._once(self.headers, where.block))
+            described = _axes(header, self.scale_exponent)
+            chosen = [_Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
+            x, y, z = self._decoded(header, where, chosen, decode)
+            return x, y, z
+
+        # Always so, which XLA does not know.
+        x, y, z = lax.cond(where.block <= BLOCK_BITS, decoded, lambda: nothing)
+        return Leaf(tuple(x), tuple(y), tuple(z), _first_corner_along(x, y, z, axes), *self._named(where))
+
+    def _named(self, where: "_Run") -> tuple[Array, Array]:
+        """Which lanes hold a triangle of a run, and their names."""
+        lane = self._lanes()
+        name = (where.block << 8 | ((where.said & 0xFF) + lane)).astype(jnp.int32)
+        return lane <= (where.said >> 8 & 7), name
+
+    def _decoded(self, header: Any, where: "_Run", axes: list["_Axis"], decode: Decode) -> list[list[Array]]:
+        """Coordinates along axes of the corners a, b, c of a run's triangles, scaled."""
+        corners = self._corners(header, where.said, decode.flips)
+        return self._positions(header, corners, axes, decode)
+
+    def visit_leaf(self, shear: Shear, where: "_Run", best: Best, options: WalkOptions) -> Best:
+        """Decode the triangles of a run and test them, against the closest hit so far."""
 
         def decoded() -> Leaf:
-            return self.leaf_of(shear.axes, child, options.decode)
+            return self.leaf_of(shear.axes, where, options.decode)
 
         leaf = decoded()
         t = leaf.crossings(shear, test=options.test, again=decoded)
         if options.any_hit:
             return found_any(best, t)
-        found = any_lane((t > 0) & (t <= best.t))
-        return lax.cond(found, lambda: self._merged(best, t, leaf.name), lambda: best)
+        return nearer(best, t, leaf.name, self.faces_of if self.has_faces else None)
 
-    def triangles_of(self, child: Array) -> Array:
+    def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""
-        return jnp.where(child < 0, (self._run_of(child)[1] >> 8 & 7) + 1, 0).astype(jnp.int32)
+        return ((where.said >> 8 & 7) + 1).astype(jnp.int32)
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
         """A node is eight boxes and 64 bytes; a leaf a run, a header, indices and vertices: see the notes."""
@@ -236,16 +248,6 @@ class PackedScene(NamedTuple):
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
         return walk_rays(self, ready, options)
-
-    def _merged(self, best: Best, t: Array, name: Array) -> Best:
-        """The closest hits with those of a run; faces are only read for hits at the same t."""
-        tied = (t > 0) & (t == best.t)
-        if self.has_faces:
-            mine, others = (lambda: self.faces_of(name)), (lambda: self.faces_of(best.name))
-            tied = lax.cond(any_lane(tied), lambda: tied & (mine() < others()), lambda: tied)
-        else:
-            tied = tied & (name < best.name)
-        return replaced(best, (t > 0) & (t < best.t) | tied, t, name)
 
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""
@@ -311,7 +313,7 @@ class PackedScene(NamedTuple):
         """As `box.passes`."""
         return passes(low, high, limit)
 
-    def _run_of(self, child: Array) -> tuple[Array, Array]:
+    def _run_of(self, child: Array) -> "_Run":
         """The block of a leaf, and what is said of its run."""
         code = index(~child)
         node, slot = code >> 3, code & 7
@@ -325,7 +327,8 @@ class PackedScene(NamedTuple):
         second = _used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
         rank = self._ones(first | second >> 1) - self._ones(inner & below)
         block = head[1] & BLOCK_BITS
-        return block, self._once(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
+        said = self._once(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
+        return _Run(block, said)
 
     def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
@@ -369,14 +372,13 @@ class PackedScene(NamedTuple):
         return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
-        self, header: Array, corners: tuple[Array, Array, Array], decode: Decode
+        self, header: Any, corners: tuple[Array, Array, Array], axes: list["_Axis"], decode: Decode
     ) -> list[list[Array]]:
-        """Scaled coordinates x, y, z of the corners, (8,) float32 each."""
+        """Scaled coordinates of the corners along axes, (8,) float32 each."""
         counts = header[2]
         triangles, strips, has_flips = (counts & 0xFF) + 1, (counts >> 16 & 0xFF) + 1, counts >> 24 & 1
         index_width = 32 - _leading_zeros(counts >> 8 & 0xFF)
         vertices = (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
-        axes = _axes(header, self.scale_exponent)
         stride = axes[0].width + axes[1].width + axes[2].width
         found = []
         for corner in corners:
@@ -386,6 +388,18 @@ class PackedScene(NamedTuple):
             vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
         return [[vertex[axis] for vertex in found] for axis in range(3)]
+
+
+class _Run(NamedTuple):
+    """Where the triangles of a leaf are: () uint32 each.
+
+    Attributes:
+        block: The block.
+        said: What `kernels.packed_hits.describe_runs` says of the run.
+    """
+
+    block: Array
+    said: Array
 
 
 class _Axis(NamedTuple):
@@ -467,6 +481,25 @@ def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
         tail = (y[i] < y[j]) | ((y[i] == y[j]) & (z[i] < z[j]))
         return (x[i] < x[j]) | ((x[i] == x[j]) & tail)
 
+    return _first_by(before)
+
+
+def _first_corner_along(x: Corners, y: Corners, z: Corners, axes: tuple[Array, Array, Array]) -> Array:
+    """The same, of coordinates along axes: those along x weigh more than those along y and z together."""
+    weights = [jnp.where(axis == 0, 4, jnp.where(axis == 1, 2, 1)).astype(jnp.float32) for axis in axes]
+
+    def before(i: int, j: int) -> Array:
+        total = jnp.float32(0)
+        for along, weight in zip((x, y, z), weights, strict=True):
+            side = jnp.where(along[i] > along[j], weight, np.float32(0))
+            total = total + jnp.where(along[i] < along[j], -weight, side)
+        return total < 0
+
+    return _first_by(before)
+
+
+def _first_by(before: Callable[[int, int], Array]) -> Array:
+    """Which corner is the first, by what says whether one comes before another."""
     last = jnp.where(before(1, 0), before(2, 1), before(2, 0))
     return jnp.where(last, 2, jnp.where(before(1, 0), 1, 0))
 

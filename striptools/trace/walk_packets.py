@@ -21,7 +21,7 @@ Differences:
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +68,7 @@ class PacketScene(WalkScene, Protocol):
         """Sides of the box in one lane, () float32 each, as of `sides_of`."""
         ...
 
-    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], where: Any, decode: Decode | None) -> Leaf:
         """`leaf_of` for one leaf and many rays."""
         ...
 
@@ -245,10 +245,10 @@ def _triangles_in(packet: _Packet, leaf: Leaf, limit: Array) -> Array:
 
 
 def _test_leaf(
-    scene: PacketScene, packet: _Packet, child: Array, rays: Array, found: _Found, options: WalkOptions
+    scene: PacketScene, packet: _Packet, where: Any, rays: Array, found: _Found, options: WalkOptions
 ) -> _Found:
     """Test a leaf, that the `rays` (bits) may meet, by these rays or by its triangles."""
-    leaf = scene.leaf_for_packets(packet.axes, child, options.decode)
+    leaf = scene.leaf_for_packets(packet.axes, where, options.decode)
     triangles = _triangles_in(packet, leaf, found.limit)
     ray_count, count = (lax.population_count(bits).astype(jnp.float32) for bits in (rays, triangles))
     by_ray = ray_count * RAY_OVER_TRIANGLE < count
@@ -372,11 +372,13 @@ def _walk_packet(
 
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
         place = state.place
+        # Before rays are tested, which goes on while its loads are waited for.
+        where = scene.find_leaf(place.child)
         # Between the rays of a packet there may be room for a leaf: then it is not even read.
         rays = _bits(_rays_in(packet, _box_of(scene, packet, place), found.t))
         found = lax.cond(
             rays != 0,
-            lambda: _test_leaf(scene, packet, place.child, rays, found, options),
+            lambda: _test_leaf(scene, packet, where, rays, found, options),
             lambda: found,
         )
         there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)

@@ -17,7 +17,7 @@ that of the triangle found is at most 2**-20 of the largest coordinate of point 
 which the tests hold against float64.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,7 +105,8 @@ def _walk(scene: WalkScene, point: Array, stack: Array, options: PointOptions) -
     state = lax.while_loop(goes_on, turn, _State(stack, height, jnp.int32(0), nothing))
     name = jnp.where(state.height > 0, STUCK, state.nearest.name)
     found = name >= 0
-    leaf = _leaf(scene, jnp.where(found, state.nearest.leaf, -1), options.decode)
+    where = scene.find_leaf(jnp.where(found, state.nearest.leaf, -1))
+    leaf = _leaf(scene, where, options.decode)
     held = jnp.arange(WIDTH, dtype=jnp.int32) == state.nearest.lane
     corners = [jnp.where(held & found, lanes, 0).sum() for axis in (leaf.x, leaf.y, leaf.z) for lanes in axis]
     return state.stack, Closest(name, jnp.stack(corners))
@@ -132,8 +133,9 @@ def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: De
     above = index(jnp.where(child >= 0, state.height, len(stack) - 1))
     stack = lax.dynamic_update_slice(stack, below[None], (above, jnp.uint32(0)))
     at_leaf = (child < 0) & (child != DONE)
+    where = scene.find_leaf(child)
     nearest = lax.cond(
-        at_leaf, lambda: _visit_leaf(scene, at, child, state.nearest, decode), lambda: state.nearest
+        at_leaf, lambda: _visit_leaf(scene, at, child, where, state.nearest, decode), lambda: state.nearest
     )
     return _State(stack, height, state.turns + 1, nearest)
 
@@ -149,9 +151,9 @@ def box_squares(boxes: Array, at: Vector, margin: Array) -> Array:
     return jnp.where(jnp.isnan(boxes[0]), jnp.float32(jnp.nan), total * np.float32(1 - 2.0**-21))
 
 
-def _leaf(scene: WalkScene, child: Array, decode: Decode | None) -> Leaf:
+def _leaf(scene: WalkScene, where: Any, decode: Decode | None) -> Leaf:
     axes = (jnp.uint32(0), jnp.uint32(1), jnp.uint32(2))
-    return scene.leaf_of(axes, child, decode)
+    return scene.leaf_of(axes, where, decode)
 
 
 def _corners_from(leaf: Leaf, at: Vector) -> tuple[Vector, Vector, Vector]:
@@ -212,10 +214,10 @@ def _cross(p: Vector, q: Vector) -> Vector:
 
 
 def _visit_leaf(
-    scene: WalkScene, at: Vector, child: Array, nearest: Nearest, decode: Decode | None
+    scene: WalkScene, at: Vector, child: Array, where: Any, nearest: Nearest, decode: Decode | None
 ) -> Nearest:
     """The closest triangle with those of a leaf; of equals, that of the least face."""
-    leaf = _leaf(scene, child, decode)
+    leaf = _leaf(scene, where, decode)
     a, b, c = _corners_from(leaf, at)
     squares = triangle_squares(a, b, c)
     if leaf.filled is not None:

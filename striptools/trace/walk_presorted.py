@@ -188,7 +188,7 @@ def _walk(scene: PresortedScene, ray: ReadyRay, stack: Array, options: WalkOptio
         return going & (walked.found.face < 0) if options.any_hit else going
 
     place, stack, found = lax.while_loop(goes_on, descend_to_tree, Walked(start, stack, found))
-    best = Best(found.nearest, found.nearest[None], found.face[None])
+    best = Best(found.nearest, found.face)
     counted = Counters(*found.counts) if options.counting else no_counts()
     return stack, Ended(best, counted, place.turns > scene.most_turns)
 

@@ -23,7 +23,6 @@ from striptools.trace.walk import (
     ReadyRay,
     Traced,
     WalkOptions,
-    closest_name,
     ready_ray,
 )
 
@@ -75,7 +74,7 @@ def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack:
     def one(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         ray = ready_ray(row)
         stack, ended = walk(scene, ray, stack, options)
-        name = closest_name(ended.best)
+        name = ended.best.name
         t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(ended.best.nearest * ray.t_unit))
         counted = jnp.stack([jnp.asarray(each, jnp.int32) for each in ended.counters])
         counted = jnp.where(is_live(ray), counted, 0) if options.counting else jnp.zeros(0, jnp.int32)
@@ -100,7 +99,7 @@ def no_counts() -> Counters:
 
 def nothing_yet(ray: ReadyRay) -> Best:
     """What a ray has found before its walk."""
-    return Best(ray.t_max, jnp.full(WIDTH, ray.t_max), jnp.full(WIDTH, MISS, jnp.int32))
+    return Best(ray.t_max, jnp.int32(MISS))
 
 
 def test_leaf(leaves: Leaves, leaf: Array, ray: ReadyRay, best: Best) -> Best:

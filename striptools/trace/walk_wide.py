@@ -67,24 +67,27 @@ class WideScene(NamedTuple):
         bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
         return lax.bitcast_convert_type(bits, jnp.int32)
 
-    def visit_leaf(self, shear: Shear, child: Array, best: Best, options: WalkOptions) -> Best:
-        """Test the triangles of a leaf, each lane against its own closest hit."""
-        block = index(-(child + 1))
+    def find_leaf(self, child: Array) -> Array:
+        """The block of a leaf."""
+        return index(-(child + 1))
+
+    def visit_leaf(self, shear: Shear, where: Array, best: Best, options: WalkOptions) -> Best:
+        """Test the triangles of a leaf, against the closest hit so far."""
         if not options.any_hit:
-            return test_block(self.blocks, block, shear, best, options.test)
+            return test_block(self.blocks, where, shear, best, options.test)
 
         def at_hand() -> Leaf:
-            return leaf_in(self.blocks, block, shear.axes)
+            return leaf_in(self.blocks, where, shear.axes)
 
         return found_any(best, at_hand().crossings(shear, test=options.test, again=at_hand))
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
-        return leaf_in(self.blocks, index(-(child + 1)), axes)
+        return leaf_in(self.blocks, where, axes)
 
-    def leaf_for_packets(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def leaf_for_packets(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The same: nothing is decoded."""
-        return self.leaf_of(axes, child, decode)
+        return self.leaf_of(axes, where, decode)
 
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""
@@ -100,9 +103,9 @@ class WideScene(NamedTuple):
         """Walk packets made ready."""
         return walk_packets(self, ready, options)
 
-    def triangles_of(self, child: Array) -> Array:
+    def triangles_of(self, where: Array) -> Array:
         """() int32: how many triangles a leaf has."""
-        return triangles_in(self.blocks, index(-(child + 1)))
+        return triangles_in(self.blocks, where)
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
         """A node is eight boxes and 224 bytes, a leaf 320 bytes."""

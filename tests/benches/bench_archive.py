@@ -29,7 +29,8 @@ import numpy as np
 from results import Row, append
 
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.layout import ENTRY, HEADER
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.reader import open_scene

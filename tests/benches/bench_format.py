@@ -23,8 +23,9 @@ import striptools
 from striptools.hierarchies.packed import build_inner
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
+from striptools.options import Options
 from striptools.partition.sah import PartitionOptions
-from striptools.pipeline import Options, convert
+from striptools.pipeline import convert
 from striptools.reducem.blocks import decode_blocks, encode_blocks
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.scene import Scene

@@ -24,7 +24,8 @@ from results import Row, append
 import striptools
 from striptools.mesh.attributes import Attribute
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.rays import Camera, camera_rays

@@ -23,7 +23,7 @@ from results import Row, append
 import striptools
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh, save_mesh
-from striptools.pipeline import STAGES, Options
+from striptools.options import STAGES, Options
 from striptools.reducem.quantize import PrecisionOptions
 
 BENCH = {

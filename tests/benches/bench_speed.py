@@ -22,7 +22,8 @@ from results import Row, append
 
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import STAGES, Options, convert_with_report
+from striptools.options import STAGES, Options
+from striptools.pipeline import convert_with_report
 
 BENCH = {
     "takes": "paths",

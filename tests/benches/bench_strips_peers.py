@@ -30,7 +30,8 @@ from striptools.mesh.adjacency import build_adjacency
 from striptools.mesh.clean import clean
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
-from striptools.pipeline import Options, convert
+from striptools.options import Options
+from striptools.pipeline import convert
 from striptools.strips.alternating import AlternatingOptions, alternating_strips
 from striptools.strips.ordering import OrderingOptions
 from striptools.strips.topology import classic_strips, encode_strips

@@ -36,7 +36,11 @@ class Tile(Protocol):
         """The child in a lane, as the walk names it."""
         ...
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def find_leaf(self, child: Array) -> Any:
+        """Where the triangles of leaves are."""
+        ...
+
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: Any, decode: Decode | None) -> Leaf:
         """The triangles of leaves, their corners along these axes."""
         ...
 
@@ -99,18 +103,22 @@ class WideTile(NamedTuple):
         """As `WideScene.child_of`."""
         return _bits(plgpu.load(self.nodes.at[node, 6, lane], mask=self.mask))
 
-    def leaf_of(self, axes: tuple[Array, Array, Array], child: Array, decode: Decode | None) -> Leaf:
+    def find_leaf(self, child: Array) -> Array:
+        """As `WideScene.find_leaf`."""
+        return ~child
+
+    def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """As `WideScene.leaf_of`."""
-        lane, leaf = lane_numbers(self.shape, np.int32), ~child
+        lane = lane_numbers(self.shape, np.int32)
 
         def corners(axis: Array) -> tuple[Array, Array, Array]:
             first = axis.astype(np.int32) * 3
-            rows = [self.blocks.at[leaf, first + corner, lane] for corner in range(3)]
+            rows = [self.blocks.at[where, first + corner, lane] for corner in range(3)]
             a, b, c = (plgpu.load(row, mask=self.mask) for row in rows)
             return a, b, c
 
         x, y, z = (corners(axis) for axis in axes)
-        return Leaf(x, y, z, None, None, _bits(plgpu.load(self.blocks.at[leaf, 9, lane], mask=self.mask)))
+        return Leaf(x, y, z, None, None, _bits(plgpu.load(self.blocks.at[where, 9, lane], mask=self.mask)))
 
     def faces_of(self, names: Array) -> Array:
         """Names are faces."""

@@ -214,7 +214,7 @@ class _Walk:
         """Each ray that is at a leaf tests its triangles."""
         at_leaf = (state.child < 0) & (state.child != DONE)
         tile = self.tile.among(at_leaf)
-        leaf = tile.leaf_of(self.ray.shear.axes, state.child, self.options.decode)
+        leaf = tile.leaf_of(self.ray.shear.axes, tile.find_leaf(state.child), self.options.decode)
         t, name = leaf.crossings(self.ray.shear, self.arithmetic), leaf.name
         there = at_leaf & (t > 0)
         closer = there & ((t < state.t) | self.wins_ties(there & (t == state.t), name, state.name))
