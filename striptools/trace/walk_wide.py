@@ -134,3 +134,12 @@ class WideScene(NamedTuple):
 # 32 bins and sweeps below 64 triangles 1.02 (camera) and 0.94 (occlusion), within the noise; occlusion rays
 # sorted by octant in runs of 1024 or 65536 1.08, by octant and longest axis 1.1; runs of 4096 1.0; tiles of
 # 2**14 to 2**18 rays 1.0.
+#
+# Where the time of occlusion rays goes (rebuilt, dragon; sampled): nodes 45 %, leaves 40 %, of which half waits
+# for a leaf's first cache line. Leaf lines touched before the other ray's leaf is tested: 1.01 / 1.03 / 1.015
+# (camera, occlusion closest, any hit), too little for what it looks like; touched in the node loop 0.96; the
+# next node touched before the leaf 1.0. Rays that take the next one's place as soon as they end, two to four in
+# one loop over all rays: 0.87 to 0.99, though two by two a fifth of all steps is waiting. Nodes visited until
+# all rays are at leaves, in the place of until one is: 0.95 to 1.0 on a camera's rays, 0.98 to 1.02 on others.
+# Four rays side by side with that 0.89 to 0.99. One number and one name for the closest hit, in the place of
+# eight lanes: 244 instructions a leaf for 437, and the same time.
