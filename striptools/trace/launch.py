@@ -334,6 +334,6 @@ def _collect(part: slice, room: int, traced: Any, devices: int) -> tuple[slice, 
 
 # Notes
 #
-# Two cores make 1.5 to 1.8 of one; they are busy 1.6 to 1.8 of the time. Tried for more, and lost or no gain: tiles of 2**13 to 2**15 rays, two to
-# four of them in flight, 0.95 to 1.03; rays made ready and hits weighed by a thread a device, 0.9 to 1.0
-# (beside busy devices another thread takes what it gives).
+# Two cores make 1.5 to 1.8 of one; they are busy 1.6 to 1.8 of the time. Tried for more, and lost or no gain:
+# tiles of 2**13 to 2**15 rays, two to four of them in flight, 0.95 to 1.03; rays made ready and hits weighed
+# by a thread a device, 0.9 to 1.0 (beside busy devices another thread takes what it gives).
