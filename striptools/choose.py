@@ -37,6 +37,9 @@ TABLE = "choose_table.json"
 BASELINE, TARGET = "default", "target"
 """Factors of a trade that stand for no choice of their own: the default, and what a target chose."""
 
+BOX_PRECISION, TRACED = "box precision", "traced hierarchy"
+"""Factors that no conversion chooses: of tracers."""
+
 PAIR = " x "
 """What stands between the factors of a pair."""
 
@@ -200,8 +203,9 @@ def cost_of(row: Row, target: Target) -> float:
 
 
 def may_choose(factor: str) -> bool:
-    """Whether a target may choose points of a factor: every triangle is kept, and no ray leaks."""
-    return "simplification" not in factor and factor not in ("triangle test", TARGET)
+    """Whether a target may choose points of a factor: an option of convert, every triangle kept, no leaks."""
+    of_tracers = BOX_PRECISION in factor or factor == TRACED
+    return not of_tracers and "simplification" not in factor and factor not in ("triangle test", TARGET)
 
 
 NEAR = 0.05

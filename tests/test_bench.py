@@ -1,5 +1,7 @@
 """The results file and the scripts: what is written comes back, what got worse is said, groups are run."""
 
+import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from striptools.measure import bench as module
-from striptools.measure.bench import QUICK, Row, append, bench, got_worse, last_rows
-from striptools.measure.bench_scripts import part_of, rows_of, run_script, scripts
+from striptools.measure.bench import QUICK, BenchOptions, Row, append, bench, got_worse, last_rows
+from striptools.measure.bench_scripts import Script, part_of, rows_of, run_script, scripts
 from striptools.measure.verify import VerifyOptions
 from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
@@ -208,7 +210,9 @@ def test_the_command_compares_and_ends_with_1_where_something_got_worse(
         plan = {"full": [["--value", value]], "quick": [["--value", value]], "needs": needs}
         monkeypatch.setattr(command, "_CLONE", clone_with(tmp_path, plan, end))
         code, _, said = run("bench", model, "--results", file, "--only", "fake", *more)
-        return code, said
+        *lines, took = said.splitlines(keepends=True)
+        assert re.fullmatch(r"took \d+ s\n", took)
+        return code, "".join(lines)
 
     assert measured("10") == (0, "no earlier figures of this machine to compare with\n")
     assert measured("10") == (0, "nothing got worse\n")
@@ -238,6 +242,46 @@ def test_without_a_clone_the_package_is_measured(
     assert code == 0
     assert "in a clone's tests/benches" in said
     assert {row.bench for row in rows_of(tmp_path / "bench.csv")} == {"package"}
+
+
+QUICK_GROUPS = {
+    *("archive", "classic", "format", "instances", "pipeline", "resident"),
+    *("speed", "strips", "strips_peers", "trace", "trade"),
+}
+"""What is measured where little time is given: a figure of each part, and each installed peer."""
+
+
+def test_quick_runs_the_quick_cases_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    models = [tmp_path / name for name in ("first.ply", "second.ply")]
+    for model in models:
+        model.write_bytes(part_of(CHANDELIER, tmp_path).read_bytes())
+    measured, ran = [], []
+
+    def own(given: dict[str, Mesh], options: BenchOptions) -> list[Row]:
+        measured.append((list(given), options))
+        return []
+
+    def script_run(script: Script, given: list[Path], *, quick: bool) -> tuple[list[Row], list[str]]:
+        ran.extend((script, given, call) for call in script.calls(given, quick=quick))
+        return [], []
+
+    monkeypatch.setattr(command, "bench", own)
+    monkeypatch.setattr(command, "run_script", script_run)
+    code, out, _ = run("bench", *models, "--quick", "--results", tmp_path / "bench.csv", "--format", "json")
+    assert code == 0
+    assert json.loads(out)["seconds"] >= 0
+    assert measured == [(["first"], QUICK)]
+    assert {script.group for script, *_ in ran} - {"gpu", "gpu_yardstick"} == QUICK_GROUPS - {
+        script.group for script in scripts(CLONE) if script.missing()
+    }
+    for script, given, call in ran:
+        assert [path.stem for path in given] == ["part_of_first"]
+        assert any(tuple(call[-1 - len(case) : -1]) == case for case in script.quick)
+    # Without it all of them, and what takes long.
+    ran.clear()
+    assert run("bench", models[0], "--results", tmp_path / "bench.csv")[0] == 0
+    assert {"leaks", "hierarchies", "scaling"} <= {script.group for script, *_ in ran}
+    assert measured[-1] == (["first"], BenchOptions())
 
 
 def test_a_real_script_is_run(tmp_path: Path) -> None:

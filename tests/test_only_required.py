@@ -34,6 +34,7 @@ from striptools.reducem.scene import Scene
 from striptools.trace import Tracer, functional
 from striptools.trace.instanced import instances_program
 from striptools.trace.launch import program
+from striptools.trace.packed import lay_out_packed
 
 PLAIN = Options(remap=False, threads=1)
 GEOMETRY = {"SCEN", "BLKH", "BLKD", "NODE"}
@@ -281,6 +282,53 @@ def test_a_compressed_scene_is_its_sections(remap, tmp_path):
     nodes = [one for one in found if one[1] in ((len(packed.nodes), 16), (len(packed.nodes), 64))]
     assert len(nodes) == 1
     assert sorted(found) == sorted(kinds + nodes)
+
+
+def unaligned(values: np.ndarray) -> np.ndarray:
+    """A copy that starts four bytes behind a cache line, where JAX has to copy it."""
+    memory = np.zeros(values.nbytes + 128, np.uint8)
+    first = -memory.ctypes.data % 64 + 4
+    copy = memory[first : first + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[:] = values
+    return copy
+
+
+def in_memory(boxes: str) -> Scene:
+    """A scene that no file holds, whose arrays lie where JAX copies them."""
+    scene = bare(ball(), replace(PLAIN, boxes=boxes))
+    packed, blocks = scene.packed, scene.blocks
+    assert (packed.runs is not None) is (boxes == "stored")
+    moved = {
+        name: None if values is None else unaligned(values)
+        for name, values in (
+            ("nodes", packed.nodes),
+            ("first_run", packed.first_run),
+            ("runs", packed.runs),
+        )
+    }
+    blocks = replace(blocks, headers=unaligned(blocks.headers), words=unaligned(blocks.words))
+    return replace(scene, packed=replace(packed, **moved), blocks=blocks)
+
+
+@pytest.mark.parametrize("boxes", ["stored", "rebuilt"])
+def test_nodes_and_planes_are_one_memory_on_a_cpu(boxes, monkeypatch):
+    tracer = Tracer(in_memory(boxes), device="cpu", resident="compressed")
+    arrays, kept = tracer._scene, tracer._layout.arrays
+    for k in range(len(tracer.devices)):
+        places = [a.addressable_data(k).unsafe_buffer_pointer() for a in (arrays.nodes, arrays.planes)]
+        assert places == [kept.nodes.ctypes.data] * 2
+    counted = tracer.resident_bytes
+    # A GPU has them twice.
+    monkeypatch.setattr(tracer, "_on_gpu", True)
+    assert tracer.resident_bytes == counted + kept.nodes.nbytes
+
+
+def test_what_starts_at_a_cache_line_is_not_copied():
+    first = lay_out_packed(in_memory("stored"))
+    scene = bare(ball(), replace(PLAIN, boxes="stored"))
+    aligned = replace(scene, packed=replace(scene.packed, nodes=first.arrays.nodes))
+    assert lay_out_packed(aligned).arrays.nodes is first.arrays.nodes
+    assert first.arrays.nodes.tobytes() == scene.packed.nodes.tobytes()
 
 
 @pytest.mark.parametrize("name", ["normals", "groups", "metadata", "origin", "remap"])

@@ -110,6 +110,35 @@ def test_a_share_is_kept_and_measured(keep: float) -> None:
     assert again.to_dict() == found.to_dict()
 
 
+def needles() -> Mesh:
+    """A height field so long that every vertex has angles under 2.6 degrees, where nothing collapses."""
+    mesh = wavy()
+    return replace(mesh, positions=mesh.positions * np.float32([1000, 1, 1]))
+
+
+def test_a_share_that_is_not_reached_is_told(tmp_path: Path, run: Run) -> None:
+    found = simplify(needles(), SimplifyOptions(keep=0.25))
+    assert found.wanted == round(0.25 * needles().triangle_count)
+    assert found.mesh.triangle_count > 2 * found.wanted
+    assert found.is_short
+    reached = simplify(wavy(), SimplifyOptions(keep=0.25))
+    assert reached.wanted == found.wanted
+    assert not reached.is_short
+    assert not simplify(wavy(), SimplifyOptions(largest_error=5e-3)).is_short
+    told = f"; {found.wanted:,} were asked, but no further edge collapses"
+    assert told in convert_said(needles(), tmp_path / "needles", run)
+    assert "were asked" not in convert_said(wavy(), tmp_path / "wavy", run)
+
+
+def convert_said(mesh: Mesh, folder: Path, run: Run) -> str:
+    """What a conversion to a quarter of the triangles says."""
+    folder.mkdir()
+    save_mesh(mesh, folder / "model.ply")
+    code, said, _ = run("convert", folder / "model.ply", folder / "scene.rdm", "--simplify", "25%")
+    assert code == 0
+    return said
+
+
 def test_an_error_is_kept_with_fewer_triangles() -> None:
     mesh = wavy()
     coarse = simplify(mesh, SimplifyOptions(largest_error=5e-3))

@@ -11,7 +11,7 @@ import pytest
 from striptools.choose import BASELINE
 from striptools.measure import trade as module
 from striptools.measure.plots_trade import pareto, plot_trade
-from striptools.measure.report_html import pictures_of, report_html, sentences
+from striptools.measure.report_html import pictures_of, report_html, sentences, shortfalls
 from striptools.measure.study import study_rays
 from striptools.measure.trade import STATE, Trade, TradeOptions, peer_distance, trade
 from striptools.measure.trade_pictures import difference_picture, flip, psnr
@@ -21,13 +21,22 @@ from striptools.mesh.io import load_mesh
 from striptools.mesh.mesh import Mesh
 from striptools.options import Options
 from striptools.reducem.quantize import PrecisionOptions
+from striptools_cli.trade import printed
 
 CHANDELIER = Path(__file__).parent.parent / "samples" / "chandelier.ply"
 SMALL = TradeOptions(quick=True, side=32, runs=1, picture=32, verify_rays=4, aimed_rays=64)
 BASE = Options(instances=False, geometry_only=True, remap=True)
 """What a trade makes of the default options."""
 
-NAMES = ("default", "precision: 8 bits", "simplification: 25%", "residency: compressed")
+NAMES = (
+    "default",
+    "precision: 8 bits",
+    "simplification: 25%",
+    "residency: compressed",
+    "traced hierarchy: rebuilt",
+    "box precision: 8 bits",
+    "residency x box precision: compressed, 4 bits",
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +66,7 @@ def test_points_change_one_factor() -> None:
         factors = {setting.factor for setting in found}
         assert {"precision", "simplification", "strip cap", "block size", "hierarchy", "boxes"} < factors
         assert {"residency", "precision x simplification", "residency x boxes"} < factors
+        assert {"box precision", "residency x box precision", "traced hierarchy"} < factors
         assert (
             sum(setting == replace(found[0], factor=setting.factor, value=setting.value) for setting in found)
             == 1
@@ -95,9 +105,29 @@ def test_simplified_surfaces_are_within_certified_bounds(done: tuple[Trade, Path
 
 
 def test_compressed_has_the_same_hits_in_less_memory(done: tuple[Trade, Path]) -> None:
-    base, packed = done[0].points[0], done[0].points[-1]
+    base, packed = done[0].points[0], done[0].points[3]
     assert packed.memory_bytes < base.memory_bytes
     assert (packed.t_largest, packed.t_rms, packed.psnr) == (base.t_largest, base.t_rms, 99.0)
+
+
+def test_boxes_of_any_precision_have_the_same_hits(done: tuple[Trade, Path]) -> None:
+    base, compressed, rebuilt, planes, pair = (done[0].points[k] for k in (0, 3, 4, 5, 6))
+    for point in (rebuilt, planes, pair):
+        assert (point.t_largest, point.t_rms, point.psnr) == (base.t_largest, base.t_rms, 99.0)
+        assert point.leaks == point.disagreements == 0
+    # The same floats wider, the same bytes wider: nothing is won but what a size class is.
+    assert planes.memory_bytes == base.memory_bytes
+    assert pair.memory_bytes <= compressed.memory_bytes
+
+
+def test_each_way_of_tracing_is_traced(mesh: Mesh) -> None:
+    bench = module._Bench(mesh, SMALL, Options())
+    stored = bench.tracer._layout.arrays.nodes
+    of = {setting.name: setting for setting in settings(Options())}
+    for name in ("traced hierarchy: rebuilt", "box precision: 4 bits"):
+        nodes = bench._tracer(bench.scene, of[name])._layout.arrays.nodes
+        assert nodes.shape[1:] == stored.shape[1:]
+        assert not np.array_equal(nodes, stored, equal_nan=True)
 
 
 def test_wrong_rays_are_counted(mesh: Mesh) -> None:
@@ -122,7 +152,7 @@ def test_an_interrupted_trade_goes_on(
         module._Bench, "measured", lambda self, one: (measured.append(one.name), original(self, one))[1]
     )
     again = trade(mesh, SMALL, model="part", folder=tmp_path)
-    assert measured == [NAMES[3]]
+    assert measured == list(NAMES[3:])
     assert again.points[:3] == done[0].points[:3]
     # Other options, or a damaged file: everything again.
     for text in (json.dumps({**kept, "key": "other"}), "{"):
@@ -133,9 +163,10 @@ def test_an_interrupted_trade_goes_on(
 def test_a_point_whose_setting_changed_is_measured_again(done: tuple[Trade, Path]) -> None:
     state = json.loads((done[1] / STATE).read_text())
     wanted = few(BASE)
-    changed = (*wanted[:3], replace(wanted[3], resident="expanded"))
+    changed = (*wanted[:3], replace(wanted[3], resident="expanded"), *wanted[4:])
     assert set(module._State.opened(done[1], state["key"], wanted).points) == set(NAMES)
-    assert set(module._State.opened(done[1], state["key"], changed).points) == set(NAMES[:3])
+    kept = set(NAMES) - {NAMES[3]}
+    assert set(module._State.opened(done[1], state["key"], changed).points) == kept
 
 
 def test_rays_come_from_four_views(mesh: Mesh) -> None:
@@ -188,6 +219,24 @@ def test_a_report_stands_alone(done: tuple[Trade, Path]) -> None:
     assert "&lt;b&gt;&amp;" in text
     assert len(sentences(found)) == 3
     assert all(sentence in text for sentence in sentences(found))
+
+
+def test_a_share_that_is_not_reached_is_told(done: tuple[Trade, Path]) -> None:
+    """A fault: simplifying stayed at four fifths."""
+    assert shortfalls(done[0]) == []
+    base, fewer = done[0].points[0], next(p for p in done[0].points if p.factor == "simplification")
+    stuck = replace(fewer, triangles=round(0.8 * done[0].triangles))
+    other = replace(stuck, name="simplification: 5%", value="5%")
+    pair = replace(stuck, factor="precision x simplification", value="16 bits, 25%")
+    found = replace(done[0], points=(base, stuck, other, pair))
+    left = "80% of the triangles are left, no further edge collapses"
+    lines = [
+        f"not reached: simplification: 25%; 5%: {left}",
+        f"not reached: precision x simplification: 16 bits, 25%: {left}",
+    ]
+    assert shortfalls(found) == lines
+    assert all(line in report_html(found, None, {}) for line in lines)
+    assert all(line in printed(found, "md") for line in lines)
 
 
 def test_pareto_equals_a_search_over_pairs() -> None:

@@ -1,6 +1,7 @@
 """`striptools bench`: the project's figures on any models, kept in a file and compared with the last ones."""
 
 import tempfile
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +55,11 @@ def run(
         ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Few rays and runs, a part of the first model: minutes.")
+        bool,
+        typer.Option(
+            "--quick",
+            help="Few rays and runs, a part of the first model, no group that takes long: under two minutes.",
+        ),
     ] = False,
     tolerance: Annotated[
         float | None,
@@ -80,13 +85,16 @@ def run(
     file = Path(results)
     before = last_rows(file)
     notice.before_tracing(quiet=quiet)
+    begun = time.monotonic()
     with StageProgress(quiet=quiet) as progress:
         rows, wrong = _measured(groups, paths, quick=quick, progress=progress)
+    seconds = time.monotonic() - begun
     append(rows, file)
     share = tolerance / 100 if tolerance is not None else NOISE * (2 if quick else 1)
     worse = got_worse(rows, before, noise=share)
     if form == "json":
-        say(render({"rows": [asdict(row) for row in rows], "worse": worse, "failed": wrong}, "json"))
+        found = {"rows": [asdict(row) for row in rows], "worse": worse, "failed": wrong, "seconds": seconds}
+        say(render(found, "json"))
     else:
         table = [{name: getattr(row, name) for name in _SHOWN} for row in rows]
         say(render_table(table, form, f"added to {file}", names=_SHOWN))
@@ -94,7 +102,7 @@ def run(
     if not said and not quiet:
         said = ["nothing got worse" if before else "no earlier figures of this machine to compare with"]
     if not quiet:
-        said += _left_out(groups, quick=quick)
+        said += [*_left_out(groups, quick=quick), f"took {seconds:.0f} s"]
     say("".join(f"{line}\n" for line in said), error=True)
     raise typer.Exit(EXIT_ISSUES if wrong or worse else EXIT_DONE)
 
@@ -120,6 +128,7 @@ def _measured(
     rows: list[Row] = []
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
+        paths = paths[:1] if quick else paths
         given = [part_of(paths[0], Path(folder))] if quick and any(groups.values()) else paths
         for done, (name, script) in enumerate(groups.items()):
             progress.watch(name, done / len(groups))

@@ -7,7 +7,7 @@ import typer
 
 from striptools.errors import MissingExtraError
 from striptools.measure.plots_trade import plot_trade
-from striptools.measure.report_html import pictures_of, report_html, sentences, target_lines
+from striptools.measure.report_html import pictures_of, report_html, sentences, shortfalls, target_lines
 from striptools.measure.trade import Point, Trade, TradeOptions, trade
 from striptools.mesh.atomic import write_atomically
 from striptools.mesh.io import load_mesh
@@ -53,11 +53,11 @@ def run(
 ) -> None:
     """Measure what bytes, speed and error are traded for each other, one factor at a time.
 
-    Around the default: precision, simplification, strip cap, block size, hierarchy, boxes, residency, the
-    triangle test, a few pairs, and what the targets of convert choose. Every point is traced in turn with
-    the default and judged against the source. Boxes have one precision in this format; what can be chosen is
-    whether those inside blocks are stored or rebuilt. Needs the extras trace and, for some points, simplify;
-    with --out plots too.
+    Around the default: precision, simplification, strip cap, block size, hierarchy, boxes, residency, box
+    precision, the triangle test, a few pairs, and what the targets of convert choose. Every point is traced
+    in turn with the default and judged against the source. Boxes in files have 8 bits a plane, expanded ones
+    float32; fewer bits are measured, not stored. Needs the extras trace and, for some points, simplify; with
+    --out plots too.
     """
     log.set_up(quiet=quiet)
     folder = None if out is None else folder_for(out)
@@ -113,7 +113,7 @@ def printed(found: Trade, form: Format) -> str:
         return render_table([vars(point) for point in found.points], "csv")
     rows = [_row(point) for point in found.points]
     heading = f"{found.model}: {found.triangles:,} triangles; lengths in diagonals, rays over the default's"
-    lines = sentences(found) + target_lines(found)
+    lines = sentences(found) + target_lines(found) + shortfalls(found)
     lines += [f"left out: {name}: {why}" for name, why in found.left_out.items()]
     return render_table(rows, form, heading) + "".join(f"\n{line}\n" for line in lines)
 

@@ -77,7 +77,14 @@ def said_of(simplified: Simplified) -> str:
     return (
         f"  simplified: {after:,} of {before:,} triangles; the source strays at most {there} from the "
         f"result, the result at most {back} from the source"
-    )
+    ) + _shortfall(simplified)
+
+
+def _shortfall(simplified: Simplified) -> str:
+    """That fewer triangles were asked, where they were."""
+    if not simplified.is_short:
+        return ""
+    return f"; {simplified.wanted:,} were asked, but no further edge collapses"
 
 
 def _size(text: str) -> int:

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt32
 
 from striptools.errors import UnreadableSceneError, UsageError
-from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree
+from striptools.hierarchies.wide import EMPTY, WIDTH, WideBoxes, WideTree
 from striptools.kernels import packed_nodes as kernels
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.kernels.object_split import Rows, Tree
@@ -45,6 +45,7 @@ __all__ = [
     "build_top",
     "check_packed",
     "join_tops",
+    "slots_of",
     "wide_tree",
 ]
 
@@ -169,7 +170,7 @@ def join_tops(tops: Sequence[NodeWords], roots: Roots) -> NodeWords:
     """Put the nodes over the blocks of geometries one after another, each of `build_top`, (t, 16) uint32."""
     joined = []
     for top, block, node in zip(tops, roots.blocks.tolist(), roots.tops.tolist(), strict=False):
-        moved, slots = top.copy(), _slots(top)
+        moved, slots = top.copy(), slots_of(top)
         moved[:, 0] += np.where(slots.inner.any(axis=1), node, 0).astype(np.uint32)
         moved[:, 1] += np.where(slots.leaf.any(axis=1), block, 0).astype(np.uint32)
         joined.append(moved)
@@ -265,21 +266,26 @@ def run_ranges(packed: PackedNodes, block_starts: Counts) -> tuple[Counts, Count
     return first.astype(np.int32), (runs >> 8 & 7) + 1
 
 
-def wide_tree(packed: PackedNodes, triangle_boxes: Boxes, block_starts: Counts) -> WideTree:
+def wide_tree(
+    packed: PackedNodes, triangle_boxes: Boxes, block_starts: Counts, boxes: WideBoxes | None = None
+) -> WideTree:
     """The same hierarchy with exact boxes, a run a leaf.
 
     Args:
         packed: Complete nodes, for which `check_packed` holds.
         triangle_boxes: (n, 6) float32, in file order.
         block_starts: (b+1,) int32, in triangles.
+        boxes: (m, 6, 8) float32 of the nodes' slots, to stand in place of the exact ones.
     """
     assert packed.first_run is not None
     first, count = run_ranges(packed, block_starts)
     child = np.full((len(packed.nodes), WIDTH), EMPTY, np.int32)
     kernels.slot_children(packed.nodes, packed.top_count, packed.first_run, child)
-    boxes = kernels.exact_boxes(child, first, count, np.ascontiguousarray(triangle_boxes))
-    child, boxes, depth = kernels.in_visiting_order(child, boxes)
-    return WideTree(boxes, child, first, count, int(depth))
+    held = boxes
+    if held is None:
+        held = kernels.exact_boxes(child, first, count, np.ascontiguousarray(triangle_boxes))
+    child, placed, depth = kernels.in_visiting_order(child, held)
+    return WideTree(placed, child, first, count, int(depth))
 
 
 def check_packed(
@@ -308,8 +314,8 @@ def check_packed(
     blocks = len(block_starts) - 1
     roots = roots or Roots(np.array([0, blocks]), np.array([0, packed.top_count]))
     _check_counts(packed, blocks, roots)
-    slots = _slots(packed.nodes)
-    _check_slots(packed.nodes, slots)
+    slots = slots_of(packed.nodes)
+    _checkslots_of(packed.nodes, slots)
     _check_marks(packed.nodes[: packed.top_count], slots.leaf[: packed.top_count])
     child = _check_links(packed, slots, blocks, roots)
     if packed.runs is None:
@@ -322,8 +328,8 @@ def check_packed(
 
 
 @dataclass(frozen=True, eq=False)
-class _Slots:
-    """Nodes taken apart, by NumPy alone: (m, 8) bool, planes in cells (m, 3, 8) int64."""
+class Slots:
+    """Nodes taken apart, by NumPy alone: (m, 8) bool, planes in cells of the grid (m, 3, 8) int64."""
 
     inner: np.ndarray
     empty: np.ndarray
@@ -336,7 +342,8 @@ class _Slots:
         return ~(self.inner | self.empty)
 
 
-def _slots(nodes: NodeWords) -> _Slots:
+def slots_of(nodes: NodeWords) -> Slots:
+    """Take (m, 16) uint32 nodes apart."""
     record = np.ascontiguousarray(nodes).view(np.uint8)
     planes = record[:, 16:].reshape(-1, 6, WIDTH).astype(np.int64)
     origin = record[:, 8:14].copy().view(np.uint16).astype(np.int64)
@@ -344,7 +351,7 @@ def _slots(nodes: NodeWords) -> _Slots:
     inner = np.unpackbits(record[:, 14:15], axis=1, bitorder="little").astype(np.bool_)
     empty = ((planes[:, :3] == 1) & (planes[:, 3:] == 0)).all(axis=1)
     sides = origin[:, None, :, None] + (planes.reshape(-1, 2, 3, WIDTH) << shift[:, None, :, None])
-    return _Slots(inner, empty, sides[:, 0], sides[:, 1])
+    return Slots(inner, empty, sides[:, 0], sides[:, 1])
 
 
 def _check_counts(packed: PackedNodes, blocks: int, roots: Roots) -> None:
@@ -359,7 +366,7 @@ def _check_counts(packed: PackedNodes, blocks: int, roots: Roots) -> None:
     _require((1 if complete else 0) <= packed.longest_run <= WIDTH * complete, "a wrong longest run")
 
 
-def _check_slots(nodes: NodeWords, slots: _Slots) -> None:
+def _checkslots_of(nodes: NodeWords, slots: Slots) -> None:
     """Each slot is empty or has a box, and words that say nothing are zero."""
     upright = (slots.low <= slots.high).all(axis=1)
     _require(bool((upright ^ slots.empty).all()), "a slot is neither empty nor has a box")
@@ -376,7 +383,7 @@ def _check_marks(tops: NodeWords, leaf: np.ndarray) -> None:
     _require(np.array_equal(tops[:, 1] >> 24, marks), "a node over blocks has other leaves than it says")
 
 
-def _check_links(packed: PackedNodes, slots: _Slots, blocks: int, roots: Roots) -> SlotChildren:
+def _check_links(packed: PackedNodes, slots: Slots, blocks: int, roots: Roots) -> SlotChildren:
     """Each node, block and run is reached once, from where it may be; gives the children of all slots."""
     top, nodes = packed.top_count, packed.nodes.astype(np.int64)
     complete = packed.runs is not None
@@ -412,7 +419,7 @@ def _check_blocks(block: np.ndarray, is_leaf: np.ndarray, roots: Roots) -> None:
     _require(bool(own[is_leaf].all()), "a block has not one parent")
 
 
-def _linked_runs(packed: PackedNodes, slots: _Slots, child: np.ndarray, blocks: int) -> np.ndarray:
+def _linked_runs(packed: PackedNodes, slots: Slots, child: np.ndarray, blocks: int) -> np.ndarray:
     """(m, 8) int64, the run of each slot that is one; each is reached once, from its own block."""
     assert packed.runs is not None
     assert packed.first_run is not None
@@ -457,7 +464,7 @@ def _check_runs(packed: PackedNodes, block_starts: Counts, strip_starts: Counts)
     _require(whole, "the runs do not hold every triangle once")
 
 
-def _check_boxes(slots: _Slots, held: np.ndarray, grid: BoxGrid) -> None:
+def _check_boxes(slots: Slots, held: np.ndarray, grid: BoxGrid) -> None:
     """Each slot's box holds its exact one: cells compared with a difference and with its rounding error."""
     low = grid.low.astype(np.float64)[:, None]
     sides = (slots.low, held[:, :3], 1.0), (slots.high, held[:, 3:], -1.0)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from striptools.choose import BASELINE, TARGET
+from striptools.choose import BASELINE, BOX_PRECISION, PAIR, TARGET, TRACED
 from striptools.measure.plots import LIGHT, png_of, require_plots
 from striptools.measure.trade import Point, Trade
 
@@ -20,9 +20,12 @@ INK = {
     "hierarchy": "#8a5ab5",
     "boxes": "#e0a030",
     "residency": "#d1478c",
+    TRACED: "#5a2d82",
+    BOX_PRECISION: "#8c4a1b",
     "triangle test": "#6b6f76",
     "precision x simplification": "#7fb2d6",
     "residency x boxes": "#eaa9c9",
+    f"residency{PAIR}{BOX_PRECISION}": "#d9a37f",
     TARGET: "#111111",
 }
 """A colour for each factor."""
@@ -45,6 +48,7 @@ SPEED_SIDES: Sides = {
     "residency": "below",
     "triangle test": "right",
     "hierarchy": "left",
+    TRACED: "right",
 }
 
 SHIFTS = {"left": ((-5, -3), "right"), "right": ((5, 3), "left"), "below": ((5, -5), "left")}

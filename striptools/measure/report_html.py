@@ -5,11 +5,13 @@ Nothing is loaded from elsewhere: pictures are in it as data, and there is no sc
 
 import base64
 import html
+import re
 from pathlib import Path
 
 from striptools.choose import BASELINE
 from striptools.measure.trade import Point, Trade, picture_name
 from striptools.measure.trade_targets import chosen_of
+from striptools.mesh.simplify import LEAST_TRIANGLES, reaches
 
 COLUMNS = {
     "name": "point",
@@ -60,7 +62,7 @@ def report_html(trade: Trade, plot: bytes | None, pictures: dict[str, bytes]) ->
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{title}</h1>",
         f"<p>{html.escape(_intro(trade))}</p>",
-        *(f"<p>{html.escape(line)}</p>" for line in sentences(trade)),
+        *(f"<p>{html.escape(line)}</p>" for line in sentences(trade) + shortfalls(trade)),
         "" if plot is None else f'<p><img alt="Pareto plots" src="{_inline(plot)}"></p>',
         "<h2>Targets</h2>",
         *(f"<p>{html.escape(line)}</p>" for line in target_lines(trade)),
@@ -106,6 +108,22 @@ def sentences(trade: Trade) -> list[str]:
             f"{one.wrong_per_million:,.0f} rays of a million end on another part of it."
         )
     return found
+
+
+def shortfalls(trade: Trade) -> list[str]:
+    """Which shares of the triangles simplifying did not get down to, and where it stayed, a line each."""
+    asked: dict[tuple[str, int], list[str]] = {}
+    for point in trade.points:
+        share = re.search(r"([\d.]+)%$", point.value)
+        if share and not reaches(
+            point.triangles, max(LEAST_TRIANGLES, float(share[1]) / 100 * trade.triangles)
+        ):
+            asked.setdefault((point.factor, point.triangles), []).append(point.value)
+    return [
+        f"not reached: {factor}: {'; '.join(values)}: {left / trade.triangles:.0%} of the triangles are "
+        "left, no further edge collapses"
+        for (factor, left), values in asked.items()
+    ]
 
 
 def target_lines(trade: Trade) -> list[str]:

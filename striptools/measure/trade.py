@@ -37,6 +37,7 @@ import numpy as np
 from striptools.choose import BASELINE
 from striptools.errors import MissingExtraError, UsageError
 from striptools.measure.bound import frame_rays
+from striptools.measure.box_precision import coarsened, lay_out_planes
 from striptools.measure.environment import machine, versions
 from striptools.measure.oracle import Oracle
 from striptools.measure.study import (
@@ -362,8 +363,10 @@ class _Bench:
         start = time.perf_counter()
         scene, _ = convert_with_report(source, setting.options)
         built = time.perf_counter() - start + simplifying
+        threads = self.options.threads or 1
+        traced = scene if setting.box_bits is None else coarsened(scene, setting.box_bits, threads)
         start = time.perf_counter()
-        tracer = self._tracer(scene, setting)
+        tracer = self._tracer(traced, setting)
         laid_out = time.perf_counter() - start
         parts = scene.part_bytes()
         disk = sum(parts.values()) - parts["remap"] - parts["attributes"]
@@ -408,7 +411,11 @@ class _Bench:
 
     def _tracer(self, scene: Scene, setting: Setting) -> Tracer:
         given = {"device": self.options.device, "threads": self.options.threads}
-        return Tracer(scene, **given, resident=setting.resident, test=setting.test)
+        if setting.box_bits is not None and setting.resident == "expanded":
+            return Tracer.of_layout(lay_out_planes(scene, self.options.threads or 1), **given)
+        return Tracer(
+            scene, **given, resident=setting.resident, test=setting.test, hierarchy=setting.hierarchy
+        )
 
     def _verify_options(self) -> VerifyOptions:
         return VerifyOptions(rays=self.options.verify_rays, aimed_rays=self.options.aimed_rays)

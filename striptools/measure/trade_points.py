@@ -1,17 +1,21 @@
 """The points of a trade: the default, one factor at a time around it, a few named pairs, what targets choose.
 
-There is one precision of stored boxes (8 bits a plane on the scene's grid, SPEC 4.4); what can be chosen is
-whether those inside blocks are stored or rebuilt, and that is the factor here and in the pair with residency.
+Boxes are float32 in the default, which is expanded, and 8 bits a plane in a compressed scene (SPEC 4.4). Box
+precision is varied in both: the expanded hierarchy under the file's 8 bits and fewer, and, as a pair with
+residency, the compressed one under fewer (measure/box_precision.py). Whether boxes inside blocks are stored
+or rebuilt is a factor of the file, with a pair of its own. The traced hierarchy is what an expanded tracer
+can make anew, over single triangles in float32, instead of the stored one.
 """
 
 from dataclasses import dataclass, replace
 from typing import get_args
 
-from striptools.choose import BASELINE, TARGET, TARGETS, for_target
+from striptools.choose import BASELINE, BOX_PRECISION, PAIR, TARGET, TARGETS, TRACED, for_target
 from striptools.hierarchies.options import HierarchyName, HierarchyOptions
 from striptools.options import Options
 from striptools.reducem.quantize import PrecisionOptions
 from striptools.reducem.resident import Residency
+from striptools.trace.tracer import HierarchyKind
 from striptools.types import TriangleTest
 
 BITS = (24, 22, 20, 18, 16, 14, 12, 10, 8)
@@ -25,6 +29,10 @@ QUICK_LENGTHS = (8, 32)
 QUICK_BLOCKS = (64,)
 
 TESTS: tuple[TriangleTest, ...] = ("fast", "exact-sign", "float64")
+
+BOX_BITS, QUICK_BOX_BITS = (8, 6, 4), (8,)
+PAIR_BOX_BITS, QUICK_PAIR_BOX_BITS = (6, 4), (4,)
+"""Of a compressed scene, which has 8 without a pair."""
 
 PAIR_BITS, PAIR_SHARES = (16, 12), (0.25, 0.05)
 
@@ -40,6 +48,8 @@ class Setting:
         keep: The share of the triangles that simplification keeps.
         resident: How the tracer keeps the scene.
         test: The tracer's triangle test.
+        hierarchy: Which hierarchy the tracer walks.
+        box_bits: Bits of the planes of boxes; None for what the tracer has: 8 compressed, float32 expanded.
     """
 
     factor: str
@@ -48,6 +58,8 @@ class Setting:
     keep: float = 1.0
     resident: Residency = "expanded"
     test: TriangleTest = "watertight"
+    hierarchy: HierarchyKind = "stored"
+    box_bits: int | None = None
 
     @property
     def name(self) -> str:
@@ -85,6 +97,10 @@ def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
     found += [
         Setting("boxes", "stored", stored),
         Setting("residency", "compressed", base, resident="compressed"),
+        Setting(TRACED, "rebuilt", base, hierarchy="rebuilt"),
+    ]
+    found += [
+        Setting(BOX_PRECISION, f"{b} bits", base, box_bits=b) for b in (QUICK_BOX_BITS if quick else BOX_BITS)
     ]
     found += [Setting("triangle test", test, base, test=test) for test in TESTS]
     found += [
@@ -94,6 +110,16 @@ def settings(base: Options, *, quick: bool = False) -> tuple[Setting, ...]:
         if not quick or (b, share) == (PAIR_BITS[0], PAIR_SHARES[0])
     ]
     found.append(Setting("residency x boxes", "compressed, stored", stored, resident="compressed"))
+    found += [
+        Setting(
+            f"residency{PAIR}{BOX_PRECISION}",
+            f"compressed, {b} bits",
+            stored,
+            resident="compressed",
+            box_bits=b,
+        )
+        for b in (QUICK_PAIR_BOX_BITS if quick else PAIR_BOX_BITS)
+    ]
     chosen = [one for one in _of_targets(base) if not any(_is_the_same(one, other) for other in found)]
     return tuple(found + chosen)
 

@@ -5,6 +5,11 @@ the package fast-simplification (extra `simplify`), imported only here. It promi
 distance; so the distance is measured afterwards from the source to the result and back (surface_distance.py),
 and a largest error that is asked for is kept by the certified upper bounds or refused.
 
+The package collapses no edge where a triangle would fold or get an angle under 2.6 degrees at the vertex that
+moves, though it had one before. Models made of needles stay far from the share that is asked: a board of CAD
+parts, almost half of whose faces have such an angle, at 80 %, by any of its options, in float64, and run
+again on what is left. The share that was reached is told, and that it is not the one asked.
+
 Attributes do not survive: a collapse has no rule for them here. Instances are flattened before.
 """
 
@@ -78,12 +83,19 @@ class Simplified:
         triangles_before: Of the source, once clean.
         of_source: How far points of the source are from the result.
         of_result: How far points of the result are from the source.
+        wanted: Triangles of the share that was asked; None where none was.
     """
 
     mesh: Mesh
     triangles_before: int
     of_source: Deviation
     of_result: Deviation
+    wanted: int | None = None
+
+    @property
+    def is_short(self) -> bool:
+        """Whether no further edge collapses although more triangles are left than were asked."""
+        return self.wanted is not None and not reaches(self.mesh.triangle_count, self.wanted)
 
     @property
     def error_bound(self) -> float:
@@ -95,6 +107,7 @@ class Simplified:
         return {
             "triangles_before": self.triangles_before,
             "triangles": self.mesh.triangle_count,
+            "triangles_wanted": self.wanted,
             "hausdorff_of_source": [self.of_source.lower, self.of_source.upper],
             "hausdorff_of_result": [self.of_result.lower, self.of_result.upper],
             "rms_of_source": self.of_source.rms,
@@ -131,6 +144,7 @@ def simplify(mesh: Mesh, options: SimplifyOptions, *, threads: int | None = None
         largest *= float(np.linalg.norm(whole.bounds[1] - whole.bounds[0]))
     if options.keep is not None:
         result = _measured(whole, surface, collapsed(whole, options.keep), None, threads)
+        result = replace(result, wanted=_wanted(whole, options.keep))
         if largest is not None and result.error_bound > largest:
             raise UsageError(
                 f"{result.mesh.triangle_count:,} triangles stray by up to {result.error_bound:.4g}, "
@@ -196,7 +210,7 @@ def collapsed(whole: Mesh, keep: float) -> Mesh | None:
         raise MissingExtraError(
             "simplifying needs fast-simplification", remedy='pip install "striptools[simplify]"'
         ) from error
-    wanted = max(LEAST_TRIANGLES, round(keep * whole.triangle_count))
+    wanted = _wanted(whole, keep)
     if wanted >= whole.triangle_count:
         return whole
     best = None
@@ -206,6 +220,15 @@ def collapsed(whole: Mesh, keep: float) -> Mesh | None:
         result = clean(replace(whole, positions=positions, faces=np.asarray(faces, np.int32))).mesh
         if result.triangle_count and (best is None or result.triangle_count < best.triangle_count):
             best = result
-        if best is not None and best.triangle_count <= (1 + OVER) * wanted:
+        if best is not None and reaches(best.triangle_count, wanted):
             return best
     return best
+
+
+def _wanted(whole: Mesh, keep: float) -> int:
+    return max(LEAST_TRIANGLES, round(keep * whole.triangle_count))
+
+
+def reaches(triangles: int, wanted: float) -> bool:
+    """Whether so many triangles count as the share that was asked."""
+    return triangles <= (1 + OVER) * wanted

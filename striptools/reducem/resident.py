@@ -30,6 +30,8 @@ def size_class(count: int, steps: int = EXPANDED_STEPS) -> int:
 def resident_bytes(scene: Scene, resident: Residency) -> int | None:
     """What a tracer keeps of a scene through its stored hierarchy; None where that is not counted here.
 
+    A GPU keeps the nodes of a compressed scene once more, as bytes (`Tracer.resident_bytes`).
+
     Args:
         scene: Counted are scenes of the default hierarchy without instances.
         resident: How it is kept.

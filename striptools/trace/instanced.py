@@ -152,6 +152,11 @@ class InstancedLayout:
         above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
+    @property
+    def shared_bytes(self) -> int:
+        """Those of the geometries."""
+        return self.geometries.shared_bytes
+
     def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A name alone does not tell the instance."""
         return self.named(names)[:2]

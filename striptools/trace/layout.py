@@ -75,7 +75,12 @@ class Layout(Protocol):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays."""
+        """Bytes of all arrays, once where two share them."""
+        ...
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes that two arrays share here, which a GPU keeps twice."""
         ...
 
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:

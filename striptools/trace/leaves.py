@@ -82,6 +82,11 @@ class ExpandedLayout:
         kept = _arrays_in(self.arrays)
         return sum(a.nbytes for a in kept) + self.leaves.place.nbytes + self.leaves.triangle_of.nbytes
 
+    @property
+    def shared_bytes(self) -> int:
+        """No two arrays share any."""
+        return 0
+
     def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `layout.Layout`."""
         return self.leaves.corners_of(names)

@@ -12,7 +12,7 @@ from striptools.kernels import packed_hits as kernels
 from striptools.kernels.weighing_double import packed_corners
 from striptools.trace.counters import Counters
 from striptools.trace.layout import Found, PacketView, Rays, packet_view
-from striptools.trace.leaves import aligned_zeros, reach_of, scale_of, size_class
+from striptools.trace.leaves import CACHE_LINE, aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
 from striptools.trace.walk_packed import MARGIN, PackedScene
 
@@ -90,6 +90,11 @@ class PackedLayout:
         held = (arrays.nodes, arrays.headers, arrays.words, arrays.first_run, arrays.runs, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
 
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes that nodes and planes share here, which a GPU keeps twice."""
+        return self.arrays.planes.nbytes
+
     def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `layout.Layout`."""
         arrays = self.arrays
@@ -123,8 +128,11 @@ class PackedLayout:
 def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     """Lay a scene out for the walk through its blocks; nodes that the file does not hold are built.
 
-    Arrays of a scene that holds its boxes are taken as they lie, in a mapped file too; others are copied to a
-    size class, so that scenes of like size share a program.
+    Arrays of a scene that holds its boxes are taken as they lie, in a mapped file too, where that is from a
+    cache line on; others are copied to a size class, so that scenes of like size share a program.
+
+    JAX uses arrays that start at a cache line where they lie on a CPU, and copies others. So nodes and planes
+    are one memory there; a GPU has them twice, as words and as bytes.
     """
     packed, blocks = scene.with_boxes(threads), scene.blocks
     if blocks.count > MOST_BLOCKS:
@@ -135,7 +143,7 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
         )
     assert packed.first_run is not None
     assert packed.runs is not None
-    laid: Callable[[np.ndarray], np.ndarray] = _padded if scene.packed.runs is None else np.asarray
+    laid: Callable[[np.ndarray], np.ndarray] = _padded if scene.packed.runs is None else _aligned
     scale = scale_of(scene)
     exponent = int(np.frexp(scale)[1]) - 1
     faces, rotations = _names(scene, laid)
@@ -200,6 +208,15 @@ def _padded(values: np.ndarray) -> np.ndarray:
     padded = aligned_zeros((size_class(len(values), STEPS), *values.shape[1:]), values.dtype.type)
     padded[: len(values)] = values
     return padded
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """The values from a cache line on: themselves, or a copy where they start elsewhere."""
+    if values.ctypes.data % CACHE_LINE == 0:
+        return values
+    copy = aligned_zeros(values.shape, values.dtype.type)
+    copy[:] = values
+    return copy
 
 
 __all__ = ["PackedLayout", "decode_of", "lay_out_packed"]

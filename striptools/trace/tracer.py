@@ -203,8 +203,10 @@ class Tracer:
 
     @property
     def resident_bytes(self) -> int:
-        """Bytes of all arrays kept for tracing."""
-        return 0 if self._empty else self._layout.nbytes
+        """Bytes of all arrays kept for tracing; a GPU keeps the nodes of a compressed scene as bytes too."""
+        if self._empty:
+            return 0
+        return self._layout.nbytes + (self._layout.shared_bytes if self._on_gpu else 0)
 
     def closest_hit(
         self,

@@ -72,7 +72,7 @@ class PackedScene(NamedTuple):
 
     Attributes:
         nodes: (m, 16) uint32, SPEC 4.4.
-        planes: (m, 64) uint8, the same memory.
+        planes: (m, 64) uint8, the same bytes: on a CPU the same memory, on a GPU an array of its own.
         headers: (b, 8) uint32, SPEC 4.2.
         words: (w,) uint32, the streams, and zeros behind them that a load may touch.
         first_run: (b,) uint32.

@@ -27,7 +27,7 @@ BENCH = {
     "takes": "paths",
     "models": ["bunny", "dem_jacksboro", "icub", "chandelier", "tree_japanesemaple", "dragon", "powerplant"],
     "full": [[]],
-    "quick": [["--rays", "4000"]],
+    "quick": [],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
 

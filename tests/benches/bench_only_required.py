@@ -34,7 +34,7 @@ BENCH = {
     "takes": "paths",
     "models": ["bunny", "dragon"],
     "full": [[]],
-    "quick": [["--repeats", "1"]],
+    "quick": [],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
 

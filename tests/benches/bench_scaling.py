@@ -31,7 +31,7 @@ BENCH = {
     "takes": "paths",
     "models": ["dragon"],
     "full": [[]],
-    "quick": [["--seconds", "2", "--side", "128"]],
+    "quick": [],
 }
 
 QUIET = 1.1
