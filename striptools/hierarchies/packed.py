@@ -315,7 +315,7 @@ def check_packed(
     roots = roots or Roots(np.array([0, blocks]), np.array([0, packed.top_count]))
     _check_counts(packed, blocks, roots)
     slots = slots_of(packed.nodes)
-    _checkslots_of(packed.nodes, slots)
+    _check_slots(packed.nodes, slots)
     _check_marks(packed.nodes[: packed.top_count], slots.leaf[: packed.top_count])
     child = _check_links(packed, slots, blocks, roots)
     if packed.runs is None:
@@ -366,7 +366,7 @@ def _check_counts(packed: PackedNodes, blocks: int, roots: Roots) -> None:
     _require((1 if complete else 0) <= packed.longest_run <= WIDTH * complete, "a wrong longest run")
 
 
-def _checkslots_of(nodes: NodeWords, slots: Slots) -> None:
+def _check_slots(nodes: NodeWords, slots: Slots) -> None:
     """Each slot is empty or has a box, and words that say nothing are zero."""
     upright = (slots.low <= slots.high).all(axis=1)
     _require(bool((upright ^ slots.empty).all()), "a slot is neither empty nor has a box")

@@ -9,8 +9,7 @@ Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017), section 3.
 Differences:
 
 1. A few rays go side by side in one instruction stream, so that one's arithmetic fills the other's waits:
-   two on a CPU, one on a GPU. A ray that has reached a leaf, or its end, waits while another is at inner
-   nodes.
+   two on a CPU, one on a GPU. Leaves are visited as soon as one of them is at one.
 2. Leaves are tested eight triangles at once; hits are looked at one by one only where there are any.
 3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
    the same t the one of the smaller face is kept: the result does not depend on the order of visits.
@@ -585,6 +584,13 @@ class _Walk:
             found = found | at(place)
         return found & (state.turns <= len(self.rays) * self.scene.node_count)
 
+    def is_among_nodes(self, state: _State) -> Array:
+        """Whether some ray is at an inner node and none at a leaf: one that is there is not kept waiting."""
+        none_at_leaf = jnp.bool_(True)
+        for place in state.places:
+            none_at_leaf = none_at_leaf & ((place.child >= 0) | (place.child == DONE))
+        return none_at_leaf & self.goes_on(state, lambda place: place.child >= 0)
+
     def visit_nodes(self, state: _State, bests: tuple[Found, ...]) -> _State:
         """Each ray that is at an inner node visits it."""
         visits = [
@@ -667,11 +673,7 @@ def _walked(walk: _Walk, stacks: tuple[Array, ...], bests: tuple[Any, ...]) -> t
 
     def nodes_then_leaves(carried: tuple[_State, tuple[Any, ...]]) -> tuple[_State, tuple[Any, ...]]:
         state, bests = carried
-        state = lax.while_loop(
-            lambda s: walk.goes_on(s, lambda place: place.child >= 0),
-            lambda s: walk.visit_nodes(s, bests),
-            state,
-        )
+        state = lax.while_loop(walk.is_among_nodes, lambda s: walk.visit_nodes(s, bests), state)
         return walk.visit_leaves(state, bests)
 
     return lax.while_loop(

@@ -528,28 +528,30 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # Notes
 #
 # Stanford dragon, one thread, a machine with other work; rays a second over those of the expanded walk,
-# camera / occlusion / any hit, ratios of processor time: 0.60-0.65 / 0.70-0.73 / 0.73-0.76; bunny 0.60-0.62 /
-# 0.63-0.67 / 0.64-0.69. Without a remap 0.02 more. What gave most, in the order it was done: words selected
-# from a few loaded scalars instead of gathers, and runs that say where corners are (0.44 to 0.48 / 0.46 to
-# 0.59 / 0.48 to 0.58); one gather of rows of words (0.03); the remap read for ties alone, hits merged under a
-# cond of their own (0.07 / 0.08 / 0.1). Nodes alone, over expanded leaves, take 0.80-0.83 / 0.86 / 0.87-0.9.
+# ratios of processor time: camera in packets 0.68-0.71, one by one 0.66-0.68, occlusion closest 0.69-0.74,
+# any hit 0.71-0.73; bunny 0.66, 0.62, 0.62, 0.59. Without a remap 0.02 more. What gave most, in the order it
+# was done: words selected from a few loaded scalars instead of gathers, and runs that say where corners are;
+# one gather of rows of words (0.03); the remap read for ties alone, hits merged under a cond of their own
+# (0.07 to 0.1); the run found before rays part, where its loads overlap (0.02 to 0.04); in packets axes
+# chosen before the coordinates are decoded, not after (0.04): a choice of lanes by one number ends as
+# scalars. Nodes alone, over expanded leaves, take 0.80-0.83 / 0.86 / 0.87-0.9 (camera, occlusion, any hit).
 #
 # Where the time goes (camera rays from the picture's middle): the expanded walk takes 255 of 348 ns, 54 % of
 # it in the node loop; this one 437 of 564, 39 %. So nodes cost 32 ns more, leaves 150, weights of hits 30.
 #
-# Ratios of speed to what stands here, on a busy machine. Lost: ten vertices of a strip decoded
-# once, the far corners gathered from them, 0.92 (2100 instructions fewer, but through memory), with a
-# concatenation 0.57; both rays' leaves at once under vmap 0.82, one after the other without a cond 0.85; near
-# and far planes chosen by the direction's signs in the loop 0.92; words selected for each coordinate 1.0; the
-# closest hits marked by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along
-# 0.92. No gain: the closest hit by the least integer, any lane by a sum of integers, one count of bits in the
-# place of two, fewer words of a record read, hits weighed in two passes of 64. Three words a vertex in the
-# place of the four that the widest blocks need would give 1.02.
+# Ratios of speed to what stands here, on a busy machine. Lost: ten vertices of a strip decoded once, the far
+# corners gathered from them, 0.92 (2100 instructions fewer, but through memory), with a concatenation 0.57;
+# both rays' leaves at once under vmap 0.82, one after the other without a cond 0.85; near and far planes
+# chosen by the direction's signs in the loop 0.92; words selected for each coordinate 1.0; the closest hits
+# marked by their sign behind one barrier 0.89 (of the expanded walk too); faces carried along 0.92. No gain:
+# the closest hit by the least integer, any lane by a sum of integers, one count of bits in the place of two,
+# fewer words of a record read, hits weighed in two passes of 64. Three words a vertex in the place of the
+# four that the widest blocks need would give 1.02.
 #
-# In packets: 0.48-0.50 of expanded packets when they came, the run found once 0.56, the header too 0.585,
-# a node's grid read once an axis 0.60, leaves that no ray of the packet meets left unread 0.62 (of the
-# dragon's 18 leaves a packet one in five). Bunny 0.49 to 0.54. One by one the run found once is 1.00 to 1.02,
-# the header too 0.97: there latency counts, and what is kept goes through memory.
+# In packets: 0.48-0.50 of expanded packets when they came, the run found once 0.56, the header too 0.585, a
+# node's grid read once an axis 0.60, leaves that no ray of the packet meets left unread 0.62 (of the dragon's
+# 18 leaves a packet one in five). Bunny 0.49 to 0.54. One by one the run found once is 1.00 to 1.02, the
+# header too 0.97: there latency counts, and what is kept goes through memory.
 #
 # XLA compiles each of the nine coordinates of a leaf on its own, with all that leads to it; LLVM unrolls a
 # loop of eight that is short before it makes vectors of it, so that short ones end as scalars and recomputing
@@ -560,3 +562,9 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # modes blended by masks 0.99. A cache of 64 to 4096 leaves decoded lately, filled in a loop of one turn: 0.55
 # to 1.0 in packets (nearly half of the visits miss in 1024 leaves) and 0.90 one by one: looking is as dear as
 # decoding.
+#
+# Found before rays part, lost: the header with the run 0.98 to 1.0, the words of the corners' indices too
+# 0.97, a word of the first vertex touched 0.97. In packets the header with the run 1.0, indices 1.0. A leaf's
+# box tested again before it is decoded (one by one): 0.96 to 0.98. One by one, axes chosen before decoding:
+# 0.96. The chosen lanes blended by masks: 0.94 in packets. Corners put in their order behind a second cond:
+# 0.97. Each cond costs: indices behind one, words behind another, coordinates behind a third 0.86.
