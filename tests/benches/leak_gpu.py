@@ -16,12 +16,11 @@ from striptools.trace.walk import Traced, WalkOptions, WalkScene, prepared_rays,
 
 RAYS_AT_ONCE = (2**8, 2**12)
 
-QUICK = {
-    "xla_backend_optimization_level": 0,
-    "xla_llvm_disable_expensive_passes": True,
-    "xla_disable_hlo_passes": "fusion",
-}
-"""How programs are compiled: what XLA makes of the kernel's on a CPU takes minutes otherwise."""
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""How programs are compiled, to take seconds."""
+
+UNFUSED = {"xla_disable_hlo_passes": "fusion"}
+"""And the kernel's over packed leaves: fusing the decoding takes minutes."""
 
 
 class GpuWalk(Tracer):
@@ -49,7 +48,9 @@ class GpuWalk(Tracer):
 @lru_cache(maxsize=16)
 def _program(by_kernel: bool, options: WalkOptions) -> Any:
     """The jitted function from a scene and rays to `Traced`."""
-    return jax.jit(partial(_walked, by_kernel=by_kernel, options=options), compiler_options=QUICK)
+    unfused = UNFUSED if by_kernel and options.decode is not None else {}
+    walk = partial(_walked, by_kernel=by_kernel, options=options)
+    return jax.jit(walk, compiler_options={**QUICK, **unfused})
 
 
 def _walked(scene: WalkScene, *rays: Any, by_kernel: bool, options: WalkOptions) -> Traced:
