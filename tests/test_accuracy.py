@@ -20,8 +20,6 @@ from test_hoisting import loops_outside_hoisted_calls
 from test_trace import flushed
 
 from striptools.errors import UsageError
-from striptools.hierarchies.options import HierarchyOptions
-from striptools.hierarchies.slbvh import build_slbvh
 from striptools.kernels.rays import ROW, add_ways, ready_rays
 from striptools.measure.bound import frame_rays, judge_pairs
 from striptools.measure.exact import exact_pair
@@ -457,8 +455,3 @@ def test_neither_packets_nor_kernels_walk_by_other_tests(monkeypatch: pytest.Mon
 def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(UsageError, match="no such triangle test"):
         Tracer(small_scene(), test="slow")  # pyright: ignore[reportArgumentType]
-    scene = small_scene()
-    slbvh = build_slbvh(scene.triangle_boxes(1), HierarchyOptions("slbvh"))
-    with pytest.raises(UsageError, match="hierarchy rebuilt"):
-        tracer_of(replace(scene, hierarchy=slbvh), "float64")
-    assert Tracer(replace(scene, hierarchy=slbvh), device="cpu", hierarchy="rebuilt", test="float64")

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from strategies import cube, grid, sphere, tetrahedron
 import striptools
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Hits, Tracer
+from striptools.trace.pallas import walk as kernel
+from striptools.types import TriangleTest
 
 sys.path.insert(0, str(Path(__file__).parent / "benches"))
 import bench_leaks as bench
+import leak_gpu
 import leak_rays
 import leak_walks
 from leak_rays import RUN, Place, Target
@@ -90,6 +94,99 @@ def test_what_slips_through_is_counted(
     count = table_of(scene, target, [batch], tracer).counts["tried", "edges"]
     # Closest and any hits, one by one and in packets.
     assert (count.leaks, count.different) == (12, 12)
+
+
+def aside(name: str) -> leak_walks.Walk:
+    return next(walk for walk in leak_walks.ASIDE if walk.name == name)
+
+
+def test_every_triangle_test_and_what_a_gpu_runs_is_in_the_table() -> None:
+    names = [walk.name for walk in leak_walks.OTHERS]
+    assert len(set(names)) == len(names)
+    tests = [f"test {test}" for test in get_args(TriangleTest) if test != "watertight"]
+    for kind in leak_walks.RESIDENT:
+        for name in (*tests, "GPU kernel, interpreted", "GPU kernel's twin"):
+            assert f"{name}, {kind}" in names
+
+
+def test_both_residencies_of_a_test_take_the_same_places() -> None:
+    # So that their hits are compared.
+    half = len(leak_walks.ASIDE) // 2
+    assert half % bench.TURNS == 0
+    for one, other in zip(leak_walks.ASIDE[:half], leak_walks.ASIDE[half:], strict=True):
+        assert one.name.replace("expanded", "compressed") == other.name
+
+
+@pytest.fixture(scope="module")
+def few(target: Target) -> list[bench.Batch]:
+    return bench.batches_of(target, 4, np.random.default_rng(5))
+
+
+@pytest.mark.parametrize(
+    "name", [walk.name for walk in leak_walks.ASIDE if walk.test not in leak_walks.LEAKY]
+)
+def test_what_stands_aside_does_not_leak(
+    scene: striptools.Scene, target: Target, few: list[bench.Batch], name: str
+) -> None:
+    table = bench.Table()
+    walk = replace(aside(name), most=64)
+    bench.trace_all(table, Place(), scene, target, few, (leak_walks.MAIN[0], walk))
+    assert not bench.has_failed(table)
+    for kind in bench.KINDS:
+        # Closest and any hits, from outside and inside.
+        assert table.counts[name, kind].rays == 4 * 64
+        assert table.counts[name, kind].sure > 0
+    assert not table.told
+
+
+def test_the_fast_test_leaks_and_that_is_no_fault(
+    scene: striptools.Scene, target: Target, batches: list[bench.Batch]
+) -> None:
+    walks = [aside(f"test fast, {kind}") for kind in leak_walks.RESIDENT]
+    table = bench.Table()
+    bench.trace_all(table, Place(), scene, target, batches, tuple(walks))
+    leaks = [[table.counts[walk.name, kind].leaks for kind in bench.KINDS] for walk in walks]
+    assert sum(leaks[0]) > 0
+    assert leaks[0] == leaks[1]
+    assert not bench.has_failed(table)
+    note = bench.rows_of("torus", target.mesh, table, bench.Amount())[0].note
+    assert note.endswith("not watertight by design")
+
+
+def test_an_exact_test_that_is_not_one_is_seen(
+    scene: striptools.Scene, target: Target, batches: list[bench.Batch]
+) -> None:
+    exact, fast = (aside(f"test {test}, expanded") for test in ("exact-sign", "fast"))
+    table = bench.Table()
+    bench.trace_all(table, Place(), scene, target, batches, (replace(exact, tracer=fast.tracer),))
+    assert sum(table.counts[exact.name, kind].leaks for kind in bench.KINDS) > 0
+    assert bench.has_failed(table)
+
+
+@pytest.mark.parametrize("name", ["GPU kernel, interpreted, expanded", "GPU kernel's twin, expanded"])
+def test_a_fault_in_what_a_gpu_runs_is_seen(
+    scene: striptools.Scene,
+    target: Target,
+    few: list[bench.Batch],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:
+    def blind(walk):
+        """The walk of nodes whose first child's box is none."""
+        return lambda scene, ready, options, **given: walk(
+            scene._replace(nodes=scene.nodes.at[:, 0, 0].set(np.nan)), ready, options, **given
+        )
+
+    for module in (kernel, leak_gpu):
+        monkeypatch.setattr(module, "walk_rays", blind(module.walk_rays))
+    leak_gpu._program.cache_clear()
+    table = bench.Table()
+    bench.trace_all(table, Place(), scene, target, few, (leak_walks.MAIN[0], replace(aside(name), most=64)))
+    leak_gpu._program.cache_clear()
+    counts = [table.counts[name, kind] for kind in bench.KINDS]
+    assert sum(count.leaks for count in counts) > 0
+    assert sum(count.different for count in counts) > 0
+    assert bench.has_failed(table)
 
 
 def test_a_hit_that_no_ray_has_is_wrong(target: Target, batches: list[bench.Batch]) -> None:

@@ -78,11 +78,21 @@ def test_walks_are_hoisted(asked):
 
 
 @pytest.mark.parametrize("resident", ["expanded", "compressed"])
-@pytest.mark.parametrize(("any_hit", "counting"), [(False, False), (True, False), (False, True)])
-def test_the_walk_over_instances_is_hoisted(any_hit, counting, resident):
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {},
+        {"any_hit": True},
+        {"counting": True},
+        {"gather": "all", "most": 16},
+        {"gather": "count", "most": 1},
+        {"gather": "windings", "most": 1},
+    ],
+)
+def test_the_walk_over_instances_is_hoisted(asked, resident):
     scene = convert(load(SCENES["nested"]))
     tracer = Tracer(scene, device="cpu", instances="shared", resident=resident)
-    options = tracer._options(any_hit=any_hit, counting=counting)
+    options = tracer._options(**asked)
     rays = np.zeros((256 * len(tracer.devices), 3), np.float32)
     lowered = instances_program(tracer._mesh, options).lower(tracer._scene, rays, rays, rays[:, 0])
     assert_hoisted(lowered, loops=5)

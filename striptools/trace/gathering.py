@@ -40,7 +40,7 @@ def all_hits(stream: Stream, weigh: Weigh, rays: Rays, k: int) -> AllHits:
     for at, traced in stream(rays, "all", 1 << (k - 1).bit_length()):
         check_ended(traced[1])
         for j in range(k):
-            nth = (np.ascontiguousarray(traced[0][:, j]), np.ascontiguousarray(traced[1][:, j]))
+            nth = tuple(np.ascontiguousarray(a[:, j]) if a.ndim == 2 and a.size else a for a in traced)
             if not (nth[1] >= 0).any():
                 break
             weigh(rays, at, nth, (t[j], face[j], u[j], v[j], triangle[j]))

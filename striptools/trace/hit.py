@@ -61,6 +61,9 @@ class AllHits:
         v: (r, k) float32.
         triangle: (r, k) int32; -1 where there are fewer.
         count: (r,) int32, how many of the k there are.
+        instance: (r, k) int32, as in `Hits`, and so are the next two: None where a scene has no instances.
+        geometry: (r, k) int32.
+        geometry_face: (r, k) int32.
     """
 
     t: Float32[np.ndarray, "r k"]
@@ -69,6 +72,9 @@ class AllHits:
     v: Float32[np.ndarray, "r k"]
     triangle: Int32[np.ndarray, "r k"]
     count: Int32[np.ndarray, " r"]
+    instance: Int32[np.ndarray, "r k"] | None = None
+    geometry: Int32[np.ndarray, "r k"] | None = None
+    geometry_face: Int32[np.ndarray, "r k"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

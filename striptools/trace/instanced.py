@@ -164,7 +164,7 @@ class InstancedLayout:
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A name alone does not tell the instance."""
         raise UsageError(
-            "only closest hits and any hits go through shared instances",
+            "a triangle's name does not tell its instance",
             where="instances",
             remedy="use instances flattened",
         )
@@ -178,7 +178,7 @@ class InstancedLayout:
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle of the flattened scene."""
         t, face, u, v, triangle = found
-        instance = traced[3]
+        instance = traced[4]
         hit = np.flatnonzero(instance >= 0)
         t[at] = traced[0]
         instance, rows = instance[hit], at[hit]

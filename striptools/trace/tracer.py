@@ -2,7 +2,9 @@
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
@@ -70,6 +72,10 @@ class Tracer:
     watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). Where
     geometries are expanded, `hierarchy` is always rebuilt.
 
+    A scene under a hierarchy of its own (SLBVH, kd-tree, presorted, loose octree) is walked through that for
+    closest and any hits. All other queries go through wide nodes, rebuilt on the first of them: that call
+    takes as long as a tracer with `hierarchy` "rebuilt", and `resident_bytes` counts both from then on.
+
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
 
@@ -89,14 +95,18 @@ class Tracer:
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
-            geometry once, for closest hits and any hits. "auto" flattens what fits in `memory_budget`, and
-            shares where it does not or where `resident` is compressed.
+            geometry once, for all that is asked of rays: hits, counts, and `contains` by parity. What is
+            measured where triangles stand, closest points and winding numbers, needs "flattened", and so do
+            triangle tests other than the default one, since rays are rounded as they are moved. "auto"
+            flattens what fits in `memory_budget`, and shares where it does not or where `resident` is
+            compressed.
         test: How a ray and a triangle are tested (`trace.triangle_tests`; bounds in `measure.bound`):
             "watertight" lets no ray slip through a closed surface, and counts as hit what is as near to it as
             float32 rounds; "fast" is Moeller and Trumbore's, which leaks; "exact-sign" hits exactly what
             exact arithmetic would, edges and corners included, t as of "watertight"; "float64" tests in
             float64, and rounds t, u and v to float32 last. Tests other than the default one go through
-            wide nodes only, without packets and without a kernel; `contains` asks the default one.
+            wide nodes only, without packets and without a kernel, rebuilt where the scene is under a
+            hierarchy of its own; `contains` asks the default one.
 
     Raises:
         UsageError: There is no such device, hierarchy, residency or test, or not both of them together; or
@@ -128,6 +138,7 @@ class Tracer:
             resident, hierarchy = _of_flattened(resident), "rebuilt"
         if scene.hierarchy is not None:
             resident = _of_alternative(resident)
+            hierarchy = hierarchy if test == "watertight" else "rebuilt"
         if resident == "auto":
             fits = hierarchy == "rebuilt" or EXPANDED_BYTES * scene.triangle_count <= budget
             resident = "expanded" if fits else "compressed"
@@ -137,7 +148,9 @@ class Tracer:
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
             if test != "watertight":
-                self._need_wide_nodes(f"triangle test {test} does not")
+                self._refuse_shared(f"triangle test {test} does not")
+        again = partial(Tracer, scene, device=device, threads=threads, hierarchy="rebuilt")
+        self._rebuild = again if scene.hierarchy is not None and hierarchy == "stored" else None
 
     @classmethod
     def of_layout(
@@ -149,9 +162,12 @@ class Tracer:
         tracer._origin = np.zeros(3)
         tracer._resident, tracer._empty = "expanded", False
         tracer._shared, tracer._numbers = False, None
-        tracer._test = "watertight"
+        tracer._test, tracer._rebuild = "watertight", None
         tracer._take(layout)
         return tracer
+
+    _rebuild: Callable[[], "Tracer"] | None
+    """Makes the tracer of wide nodes of a scene that is walked through a hierarchy of its own."""
 
     def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
         """Take the devices to trace on."""
@@ -204,9 +220,10 @@ class Tracer:
     @property
     def resident_bytes(self) -> int:
         """Bytes of all arrays kept for tracing; a GPU keeps the nodes of a compressed scene as bytes too."""
-        if self._empty:
-            return 0
-        return self._layout.nbytes + (self._layout.shared_bytes if self._on_gpu else 0)
+        shared = self._layout.shared_bytes if self._on_gpu and not self._empty else 0
+        own = 0 if self._empty else self._layout.nbytes + shared
+        beside = self.__dict__.get("_rebuilt")
+        return own + (0 if beside is None else beside.resident_bytes)
 
     def closest_hit(
         self,
@@ -329,7 +346,10 @@ class Tracer:
             UsageError: As for `closest_hit`, or k is out of range.
             StriptoolsError: As for `closest_hit`.
         """
-        return all_hits(self._gather, self._weighed, checked_rays(origins, directions, t_max), k)
+        rays, asked = checked_rays(origins, directions, t_max), self._gatherer()
+        found = all_hits(asked._gather, asked._weighed, rays, k)
+        instance, geometry, own = _instances_of(self._numbers, found.face, found.triangle)
+        return replace(found, instance=instance, geometry=geometry, geometry_face=own)
 
     def count_hits(
         self, origins: np.ndarray, directions: np.ndarray, *, t_max: np.ndarray | float | None = None
@@ -338,7 +358,7 @@ class Tracer:
 
         Arguments and errors are those of `closest_hit`.
         """
-        return counts(self._gather, checked_rays(origins, directions, t_max), "count")
+        return counts(self._gatherer()._gather, checked_rays(origins, directions, t_max), "count")
 
     def closest_point(self, points: np.ndarray, *, signed: bool = False) -> ClosestPoints:
         """Find the point of the surface closest to each point.
@@ -353,16 +373,16 @@ class Tracer:
             signed: Make distances negative inside, by `contains` by parity: for closed meshes.
 
         Raises:
-            UsageError: The points are not of this shape.
+            UsageError: The points are not of this shape, or instances are shared.
             StriptoolsError: As for `closest_hit`.
         """
         checked = checked_points(points)
         if self._empty:
             found = nothing_closest(len(checked))
         else:
-            self._need_wide_nodes()
-            options = PointOptions(self._stack_size, self._on_gpu, self._layout.decode)
-            found = closest_points(self._scene, self._layout, checked, self._mesh, options)
+            wide = self._wide_nodes("closest points do not")
+            options = PointOptions(wide._stack_size, wide._on_gpu, wide._layout.decode)
+            found = closest_points(wide._scene, wide._layout, checked, wide._mesh, options)
         if signed:
             inside = self.contains(checked)
             found.distance[inside] *= -1
@@ -383,14 +403,14 @@ class Tracer:
 
         Raises:
             UsageError: The points are not of this shape, there is no such method, or it is winding and the
-                scene is kept compressed.
+                scene is kept compressed or its instances shared.
             StriptoolsError: As for `closest_hit`.
         """
         if method == "winding":
             return np.abs(self.winding_numbers(points)) > 0.5
         if method != "parity":
             raise UsageError(f"no such method: {method!r}", remedy="use parity or winding")
-        return counts(self._gather, rays_from(checked_points(points)), "windings") % 2 == 1
+        return counts(self._gatherer()._gather, rays_from(checked_points(points)), "windings") % 2 == 1
 
     def winding_numbers(self, points: np.ndarray) -> Float32[np.ndarray, " r"]:
         """The generalised winding number of the mesh at each point, 0 at points that are not finite.
@@ -402,46 +422,65 @@ class Tracer:
             points: (r, 3) in the frame of the scene's positions.
 
         Raises:
-            UsageError: The points are not of this shape, or the scene is kept compressed.
+            UsageError: The points are not of this shape, or the scene is kept compressed or its instances
+                shared.
         """
         checked = checked_points(points)
         if self._empty:
             return np.zeros(len(checked), np.float32)
-        if self._shared:
-            self._need_wide_nodes()
+        wide = self._wide_nodes("winding numbers do not")
         if self._resident == "compressed":
             raise UsageError(
                 "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
             )
-        return winding_numbers(self._layout.arrays, checked)
+        return winding_numbers(wide._layout.arrays, checked)
 
     def program_parts(self) -> tuple[Any, WalkOptions]:
         """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
 
         Raises:
-            UsageError: There is nothing to trace.
+            UsageError: There is nothing to trace, or instances are shared.
         """
-        options = self._options()
-        if options is None:
+        if self._empty:
             raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
-        if self._shared:
-            self._need_wide_nodes()
+        wide = self._wide_nodes("functions of arrays do not")
+        options = wide._options()
+        assert options is not None
         with quiet_jax():
-            return jax.device_put(self._layout.arrays, self.devices[0]), options
+            return jax.device_put(wide._layout.arrays, self.devices[0]), options
 
-    def _need_wide_nodes(self, refused: str = "only closest hits and any hits") -> None:
-        """Refuse what only the walk of wide nodes can do."""
+    def _gatherer(self) -> "Tracer":
+        """The tracer that gathers hits: this one through shared instances, else that of wide nodes."""
+        return self if self._shared else self._wide_nodes("only closest hits and any hits")
+
+    def _wide_nodes(self, refused: str) -> "Tracer":
+        """The tracer that walks wide nodes: this one, or where its walk is another, one beside it.
+
+        Raises:
+            UsageError: There is none, naming what is `refused` to go through this layout.
+        """
+        self._refuse_shared(refused)
+        if self._empty or isinstance(self._layout.arrays, WideScene | PackedScene):
+            return self
+        if self._rebuild is None:
+            raise UsageError(
+                f"{refused} go through this hierarchy", where="hierarchy", remedy="trace a scene under it"
+            )
+        return self._rebuilt
+
+    @cached_property
+    def _rebuilt(self) -> "Tracer":
+        """The same scene under wide nodes."""
+        assert self._rebuild is not None
+        return self._rebuild()
+
+    def _refuse_shared(self, refused: str) -> None:
+        """Refuse what cannot go through shared instances."""
         if self._shared:
             raise UsageError(
                 f"{refused} go through shared instances",
                 where="instances",
                 remedy="use instances flattened",
-            )
-        if not isinstance(self._layout.arrays, WideScene | PackedScene):
-            raise UsageError(
-                f"{refused} go through this hierarchy",
-                where="hierarchy",
-                remedy="use hierarchy rebuilt",
             )
 
     def _gather(
@@ -461,8 +500,6 @@ class Tracer:
         """What to compile in; None where there is nothing to trace."""
         if self._empty:
             return None
-        if gather is not None:
-            self._need_wide_nodes()
         side_by_side = 1 if self._on_gpu else RAYS_SIDE_BY_SIDE
         decode = self._layout.decode
         plain = not counting and gather is None and self._test == "watertight"

@@ -47,7 +47,7 @@ class Gathered(NamedTuple):
 def nothing_gathered(t_max: Array, most: int) -> Gathered:
     """What a ray has met before it starts; t_max comes before any hit at t_max."""
     none = jnp.full(most, -1, jnp.int32)
-    kept = jnp.stack([jnp.broadcast_to(_bits(t_max), most), none, none], axis=1)
+    kept = jnp.stack([jnp.broadcast_to(bits_of(t_max), most), none, none], axis=1)
     return Gathered(t_max, kept, jnp.int32(0))
 
 
@@ -86,7 +86,7 @@ def _windings(leaf: "Leaf", shear: Shear) -> Array:
 
 def _inserted(scene: "WalkScene", leaf: "Leaf", t: Array, met: Array, so_far: Gathered) -> Gathered:
     """Put the hits of a leaf in their places, one after the other; what falls out at the end is lost."""
-    new = jnp.stack([_bits(t), scene.faces_of(leaf.name), leaf.name], axis=1)
+    new = jnp.stack([bits_of(t), scene.faces_of(leaf.name), leaf.name], axis=1)
 
     def insert_next(carried: tuple[Array, Array]) -> tuple[Array, Array]:
         bits, kept = carried
@@ -94,6 +94,22 @@ def _inserted(scene: "WalkScene", leaf: "Leaf", t: Array, met: Array, so_far: Ga
         return bits ^ (jnp.int32(1) << lane), _insert(kept, _row(new, lane))
 
     kept = lax.while_loop(lambda carried: carried[0] != 0, insert_next, (_bits_of(met), so_far.kept))[1]
+    return so_far._replace(nearest=_float(kept[-1, 0]), kept=kept)
+
+
+def merged(so_far: Gathered, rows: Array) -> Gathered:
+    """Put rows (m, 3) that are sorted, up to the first that is none, in their places among those kept."""
+
+    def goes_on(carried: tuple[Array, Array]) -> Array:
+        next_one, _ = carried
+        last = jnp.where(next_one < len(rows), next_one, len(rows) - 1)
+        return (next_one < len(rows)) & (_row(rows, last)[2] >= 0)
+
+    def insert_next(carried: tuple[Array, Array]) -> tuple[Array, Array]:
+        next_one, kept = carried
+        return next_one + 1, _insert(kept, _row(rows, next_one))
+
+    kept = lax.while_loop(goes_on, insert_next, (jnp.int32(0), so_far.kept))[1]
     return so_far._replace(nearest=_float(kept[-1, 0]), kept=kept)
 
 
@@ -125,7 +141,7 @@ def _with_row(rows: Array, at: Array, row: Array) -> Array:
     return lax.dynamic_update_slice(rows, row[None], (index(at), jnp.uint32(0)))
 
 
-def _bits(t: Array) -> Array:
+def bits_of(t: Array) -> Array:
     """Of a t that is not negative: ordered as t is."""
     return lax.bitcast_convert_type(t, jnp.int32)
 

@@ -12,6 +12,8 @@ stack of its own, and the closest hit is carried back.
    the same on every platform.
 4. Of two hits at the same t that of the first instance is kept: faces of the flattened source are numbered
    in the order of instances.
+5. All hits are gathered in each geometry, as many as are asked for, and merged by t, instance and face;
+   counts are summed. A mirrored instance counts windings the other way round, which parity does not see.
 
 **Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w
 move a ray into it: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d the
@@ -51,6 +53,7 @@ from striptools.trace.walk import (
     MISS,
     STUCK,
     WIDTH,
+    Alone,
     Frame,
     ReadyRay,
     WalkOptions,
@@ -60,6 +63,7 @@ from striptools.trace.walk import (
     scaled_ray,
     walk_alone,
 )
+from striptools.trace.walk_gather import Gathered, bits_of, merged, nothing_gathered
 
 NODE_BYTES = 256
 """What a node over instances reads: eight boxes, children, and factors."""
@@ -101,15 +105,17 @@ class InstancesTraced(NamedTuple):
     """One entry a ray; what was not asked for has none.
 
     Attributes:
-        t: (r,) float32; (0,) of any hit.
-        name: (r,) int32, what the geometries call the triangle hit.
+        t: (r,) float32; (0,) of any hit; (r, most) where all hits are gathered.
+        name: (r,) int32, what the geometries call the triangle hit; (r, most) where all are.
         counters: (r, 6) int32; (r, 0) where nothing is counted.
-        instance: (r,) int32, -1 on a miss.
+        counted: As of `walk.Traced`.
+        instance: (r,) int32, -1 on a miss; (r, most) where all are.
     """
 
     t: Array
     name: Array
     counters: Array
+    counted: Array
     instance: Array
 
 
@@ -121,6 +127,50 @@ class _Nearest(NamedTuple):
     instance: Array
     stuck: Array
     visits: Array
+
+    @property
+    def limit(self) -> Array:
+        """T up to which a hit counts: once there is one, one just as near may be of an instance before it."""
+        return jnp.where(self.instance >= 0, _next_above(self.nearest), self.nearest)
+
+    def after(self, number: Array, seen: Any, end: Alone, options: WalkOptions) -> "_Nearest":
+        """The same with what was found in an instance."""
+        t, name = found_alone(seen, end, options.any_hit)
+        closer = (name >= 0) & ((t < self.nearest) | (t == self.nearest) & (number < self.instance))
+        return _Nearest(
+            jnp.where(closer, t, self.nearest),
+            jnp.where(closer, name, self.name),
+            jnp.where(closer, number, self.instance),
+            self.stuck | (name == STUCK),
+            self.visits + end.visits,
+        )
+
+
+class _Met(NamedTuple):
+    """What was gathered so far, in t of the walk over instances; the faces kept are instances."""
+
+    gathered: Gathered
+    stuck: Array
+
+    @property
+    def nearest(self) -> Array:
+        """Beyond this nothing matters any more."""
+        return self.gathered.nearest
+
+    @property
+    def limit(self) -> Array:
+        """T up to which a hit counts: once as many are kept as may be, as of `_Nearest`."""
+        return jnp.where(self.gathered.name[-1] >= 0, _next_above(self.nearest), self.nearest)
+
+    def after(self, number: Array, seen: Any, end: Alone, options: WalkOptions) -> "_Met":
+        """The same with what was gathered in an instance: its faces are sorted, and stay so."""
+        stuck = self.stuck | ~end.ended
+        if options.gather != "all":
+            counted = self.gathered.counted + end.best.counted
+            return _Met(self.gathered._replace(counted=counted), stuck)
+        t, name = found_alone(seen, end, options.any_hit)
+        rows = jnp.stack([bits_of(t), jnp.broadcast_to(number, name.shape), name], axis=1)
+        return _Met(merged(self.gathered, rows), stuck)
 
 
 class _Seen(NamedTuple):
@@ -161,7 +211,7 @@ class _Seen(NamedTuple):
         """Triangles are counted in the geometries."""
         return jnp.int32(0)
 
-    def visit_leaf(self, shear: Shear, where: Array, best: _Nearest, options: WalkOptions) -> _Nearest:
+    def visit_leaf(self, shear: Shear, where: Array, best: Any, options: WalkOptions) -> Any:
         """Walk the geometry of an instance."""
         number = -(where + 1)
         at = index(number)
@@ -170,21 +220,11 @@ class _Seen(NamedTuple):
         geometries = self.scene.geometries
         frame = geometries.frame._replace(scale=jnp.float32(1), reach=_at(self.scene.reaches, at))
         seen = geometries._replace(frame=frame)
-        # Once there is a hit, one just as near may be of an instance before it.
-        limit = jnp.where(best.instance >= 0, _next_above(best.nearest), best.nearest)
         # A GPU goes through the motions for rays that are at no leaf.
         there = (where < 0) & (where != DONE)
-        row = prepared_ray(seen, origin, direction, jnp.where(there, limit, 0), _at(self.scene.roots, at))
-        end = walk_alone(seen, row, options)
-        t, name = found_alone(seen, end, options.any_hit)
-        closer = (name >= 0) & ((t < best.nearest) | (t == best.nearest) & (number < best.instance))
-        return _Nearest(
-            jnp.where(closer, t, best.nearest),
-            jnp.where(closer, name, best.name),
-            jnp.where(closer, number, best.instance),
-            best.stuck | (name == STUCK),
-            best.visits + end.visits,
-        )
+        limit = jnp.where(there, best.limit, 0)
+        row = prepared_ray(seen, origin, direction, limit, _at(self.scene.roots, at))
+        return best.after(number, seen, walk_alone(seen, row, options), options)
 
 
 def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]:
@@ -217,6 +257,7 @@ def trace_instances(
         found = jax.vmap(walk)(*rays)
     else:
         found = lax.scan(lambda nothing, ray: (nothing, walk(*ray)), None, rays)[1]
+    found = found._replace(counted=found.counted.reshape(-1))
     return found._replace(t=jnp.zeros(0)) if options.any_hit else found
 
 
@@ -227,15 +268,22 @@ def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOption
     row = prepared_ray(seen, ray[0], ray[1], ray[2], jnp.int32(0))
     none = jnp.int32(MISS)
 
-    def nothing(ready: ReadyRay) -> _Nearest:
+    def nothing(ready: ReadyRay) -> Any:
+        if options.gather is not None:
+            return _Met(nothing_gathered(ready.t_max, options.most), jnp.bool_(False))
         return _Nearest(ready.t_max, none, none, jnp.bool_(False), jnp.zeros(3, jnp.int32))
 
     ready, ended, best, visits = walk_alone(seen, row, options, nothing)
-    hit = best.instance >= 0
-    t = jnp.where(hit, in_range(best.nearest * ready.t_unit), jnp.float32(jnp.inf))
-    name = jnp.where(ended & ~best.stuck, best.name, STUCK)
-    counters = scene.visited(visits, best.visits) if options.counting else jnp.zeros(0, jnp.int32)
-    return InstancesTraced(t, name, counters, best.instance)
+    counters, counted = jnp.zeros((2, 0), jnp.int32)
+    if isinstance(best, _Met):
+        near, name, instance = best.gathered.t, best.gathered.name, best.gathered.kept[:, 1]
+        counted = best.gathered.counted
+    else:
+        near, name, instance = best.nearest, best.name, best.instance
+        counters = scene.visited(visits, best.visits) if options.counting else counters
+    t = jnp.where(instance >= 0, in_range(near * ready.t_unit), jnp.float32(jnp.inf))
+    name = jnp.where(ended & ~best.stuck, name, STUCK)
+    return InstancesTraced(t, name, counters, counted, instance)
 
 
 def _at(values: Array, place: Array) -> Array:

@@ -221,6 +221,10 @@ class Verdict:
     enclosed: np.ndarray
     farthest: np.ndarray
 
+    def part(self, count: int) -> "Verdict":
+        """Of the first ones."""
+        return Verdict(self.certain[:count], self.enclosed[:count], self.farthest[:count])
+
     @property
     def sure(self) -> np.ndarray:
         """(r,) bool: rays that could leak."""

@@ -3,16 +3,20 @@
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
+from leak_gpu import GpuWalk
 
 from striptools.hierarchies.loose_octree import build_sah_bvh
 from striptools.hierarchies.options import OVER, HierarchyOptions
 from striptools.partition.boxes import range_boxes
 from striptools.reducem.scene import Scene
 from striptools.trace import Hits, Tracer
+from striptools.trace.tracer import ResidentKind
+from striptools.types import TriangleTest
 
 
 class Traces(Protocol):
@@ -55,11 +59,15 @@ class Walk:
         name: What the table calls it.
         tracer: From a scene of the default hierarchy.
         packets: Whether rays go in packets there too.
+        test: The triangle test: hits are the same, bit for bit, as of the first walk of that test.
+        most: Rays of a batch that it takes, where it is too slow for all.
     """
 
     name: str
     tracer: Callable[[Scene], Traces]
     packets: bool = False
+    test: TriangleTest = "watertight"
+    most: int | None = None
 
 
 MAIN = (
@@ -80,6 +88,38 @@ def _binary(scene: Scene) -> Tracer:
     return Tracer(replace(scene, hierarchy=built), device="cpu")
 
 
+RESIDENT: tuple[ResidentKind, ...] = ("expanded", "compressed")
+
+LEAKY: tuple[TriangleTest, ...] = ("fast",)
+"""Tests that are not watertight by design: what slips through is counted, and no fault."""
+
+GPU_RAYS = 4096
+"""Rays of a batch that go the ways of a GPU: on a CPU these are slow."""
+
+
+def _accurate(test: TriangleTest, resident: ResidentKind) -> Walk:
+    def tracer(scene: Scene) -> Tracer:
+        return Tracer(scene, device="cpu", resident=resident, test=test)
+
+    return Walk(f"test {test}, {resident}", tracer, test=test)
+
+
+def _as_on_gpu(name: str, resident: ResidentKind, *, by_kernel: bool) -> Walk:
+    make = partial(GpuWalk, resident=resident, by_kernel=by_kernel)
+    return Walk(f"{name}, {resident}", make, most=GPU_RAYS)
+
+
+ASIDE = tuple(
+    walk
+    for resident in RESIDENT
+    for walk in (
+        *(_accurate(test, resident) for test in get_args(TriangleTest) if test != "watertight"),
+        _as_on_gpu("GPU kernel, interpreted", resident, by_kernel=True),
+        _as_on_gpu("GPU kernel's twin", resident, by_kernel=False),
+    )
+)
+"""The other triangle tests, and what a GPU runs: five a residency, so that both take the same places."""
+
 OTHERS = (
     Walk("binary SAH", _binary),
     *(Walk(f"slbvh over {over}", _under(HierarchyOptions("slbvh", over))) for over in OVER["slbvh"]),
@@ -93,9 +133,10 @@ OTHERS = (
     Walk("presorted, 10 levels", _under(HierarchyOptions("presorted", levels=10))),
     Walk("all hits, expanded", lambda scene: Gathering(Tracer(scene, device="cpu", resident="expanded"))),
     Walk("all hits, compressed", lambda scene: Gathering(Tracer(scene, device="cpu", resident="compressed"))),
+    *ASIDE,
 )
 
-SHARED = ("expanded", "compressed")
+SHARED = RESIDENT
 """How instances are shared."""
 
 Peer = Callable[[np.ndarray, np.ndarray], np.ndarray]
