@@ -29,7 +29,7 @@ BENCH = {
     "takes": "paths",
     "models": ["bunny", "dragon"],
     "full": [[]],
-    "quick": [["--repeats", "1"]],
+    "quick": [["--repeats", "3"]],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
 

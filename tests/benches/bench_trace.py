@@ -40,7 +40,7 @@ BENCH = {
     "takes": "paths",
     "models": ["bunny", "dragon", "dragon_3m5", "dem_jacksboro", "powerplant"],
     "full": [[]],
-    "quick": [["--repeats", "1"]],
+    "quick": [["--repeats", "5"]],
     "needs": ["embreex"],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
