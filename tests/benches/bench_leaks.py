@@ -259,7 +259,7 @@ def reference(table: Table, spot: Place, target: Target, batch: Batch, walk: Wal
 
 def hits_part(hits: Hits, count: int) -> Hits:
     """The first hits."""
-    return Hits(*(column[:count] for column in (hits.t, hits.face, hits.u, hits.v, hits.triangle)))
+    return Hits(hits.t[:count], hits.face[:count], hits.u[:count], hits.v[:count], hits.triangle[:count])
 
 
 def trace_batch(
