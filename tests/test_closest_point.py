@@ -99,6 +99,22 @@ def test_any_scene_the_same_in_both_residencies(drawn, seed):
     assert_closest(scene, points, one)
 
 
+def test_of_corners_as_close_both_residencies_take_the_same():
+    """A body of 1e-8 seen from 1e7 away: float64 cannot tell its corners apart, and leaves turn them."""
+    positions = np.array(
+        [[0, 0, 0], [1e-8, 0, 0], [0, 1e-8, 0], [0, 0, 1e-8], [0, 0, 1e8], [1e8, 0, 5e7]], np.float32
+    )
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3], [0, 4, 5]], np.int32)
+    scene = scene_of(Mesh(positions, faces), remap=False, max_length=2, flips=False, block=4)
+    points = around(scene.positions, 25, 0)
+    one, other = (
+        Tracer(scene, device="cpu", threads=1, resident=kind).closest_point(points)
+        for kind in ("expanded", "compressed")
+    )
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
 def test_u_and_v_give_the_point_from_the_sources_first_corner():
     positions, faces = sphere(2)
     random = np.random.default_rng(1)

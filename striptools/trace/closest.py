@@ -80,15 +80,16 @@ def _weigh(
     at = met + part.start
     triangles = corners[met].astype(np.float64).reshape(-1, 3, 3).swapaxes(1, 2)
     triangles /= float(layout.arrays.frame.scale)
+    face, triangle, turn = layout.named(names[met])
+    # Corner j as the walk has it is the face's corner (j + turn) % 3; of two as close its first is taken.
+    of_face = (np.arange(3) - turn[:, None]) % 3
+    triangles = np.take_along_axis(triangles, of_face[..., None], axis=1)
     weights = closest_weights(triangles, points[at].astype(np.float64))
     place = (weights[..., None] * triangles).sum(axis=1)
-    face, triangle, turn = layout.named(names[met])
-    # Corner j as the walk has it is the face's corner (j + turn) % 3.
-    by_face = np.take_along_axis(weights, (np.arange(3) - turn[:, None]) % 3, axis=1)
     found.point[at] = place
     found.distance[at] = np.linalg.norm(place - points[at], axis=1)
     found.face[at], found.triangle[at] = face, triangle
-    found.u[at], found.v[at] = by_face[:, 1], by_face[:, 2]
+    found.u[at], found.v[at] = weights[:, 1], weights[:, 2]
 
 
 def closest_weights(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
