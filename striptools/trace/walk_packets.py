@@ -33,16 +33,17 @@ from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
     MISS,
-    NO_NAME,
     SLACK,
     STUCK,
     WIDTH,
+    Best,
     Decode,
     Leaf,
     Place,
     Traced,
     WalkOptions,
     WalkScene,
+    nearer,
     next_child,
 )
 
@@ -272,34 +273,17 @@ def _test_leaf(
     return _Found(t, name, _limit(packet, t))
 
 
-def _faces_of(scene: PacketScene, names: Array) -> Array:
-    """What orders hits at the same t."""
-    return scene.faces_of(names) if scene.has_faces else names
-
-
 def _one_ray(
     scene: PacketScene, packet: _Packet, leaf: Leaf, lane: Array, t: Array, name: Array
 ) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
+    before = Best(*(lax.dynamic_slice(a, (lane,), (1,))[0] for a in (t, name)))
     crossing = leaf.crossings(packet.shear_of(lane))
-    old = lax.dynamic_slice(t, (lane,), (1,))[0]
-    hit = (crossing > 0) & (crossing <= old)
-
-    def replace() -> tuple[Array, Array]:
-        nearest = folded(jnp.where(hit, crossing, jnp.inf), smaller)
-        held = hit & (crossing == nearest)
-        faces = jnp.where(held, _faces_of(scene, jnp.where(held, leaf.name, 0)), NO_NAME)
-        least = folded(faces, smaller)
-        mine = folded(jnp.where(faces == least, leaf.name, NO_NAME), smaller)
-        old_name = lax.dynamic_slice(name, (lane,), (1,))[0]
-        before = _faces_of(scene, old_name[None])[0]
-        mine = jnp.where((nearest < old) | (least < before), mine, old_name)
-        return (
-            lax.dynamic_update_slice(t, nearest[None], (lane,)),
-            lax.dynamic_update_slice(name, mine[None], (lane,)),
-        )
-
-    return lax.cond(_bits(hit) != 0, replace, lambda: (t, name))
+    best = nearer(before, crossing, leaf.name, scene.faces_of if scene.has_faces else None)
+    return (
+        lax.dynamic_update_slice(t, best.nearest[None], (lane,)),
+        lax.dynamic_update_slice(name, best.name[None], (lane,)),
+    )
 
 
 def _one_triangle(
