@@ -1,6 +1,5 @@
 """The stages of a conversion, made of what the folders have for each; `pipeline` puts them in order."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -169,12 +168,8 @@ def build_hierarchy(
 ) -> Joined:
     """Build the nodes over the blocks of each geometry, put its blocks in their order, and join all."""
     grid = box_grid(*bounds_of(mesh.positions))
-
-    def built() -> Iterator[Built]:
-        for (sequences, starts), part in zip(ordered, parts, strict=True):
-            yield _built(sequences, starts, part.boxes, grid, threads)
-
-    return Joined(*join_geometries(list(built())))
+    built = [_built(*one, part.boxes, grid, threads) for one, part in zip(ordered, parts, strict=True)]
+    return Joined(*join_geometries(built))
 
 
 def _built(sequences: Sequences, starts: Counts, boxes: Boxes, grid: BoxGrid, threads: int) -> Built:

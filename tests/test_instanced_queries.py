@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from test_containment import solid_angles
 from test_instances import SCENES, load
-from test_shared_instances import KINDS, mesh_of, random_matrices, rays_through, sphere
+from test_shared_instances import KINDS, assert_same_at_once, mesh_of, random_matrices, rays_through, sphere
 
 from striptools.measure.bound import frame_rays, judge_pairs
 from striptools.mesh.instances import place
 from striptools.pipeline import convert
 from striptools.trace import Tracer, instanced, walk_instances
-from striptools.trace.instanced import geometry_boxes, instances_program, moves_of
+from striptools.trace.instanced import geometry_boxes, moves_of
 
 COLUMNS = ("t", "face", "u", "v", "triangle", "count", "instance", "geometry", "geometry_face")
 
@@ -170,13 +170,7 @@ def test_all_rays_at_once_find_the_same(few, gather, most):
     _, scene = few
     tracer, _ = tracers(scene)
     rays = (*rays_through(scene, 128, 4), np.full(128, np.inf, np.float32))
-    options = tracer._options(gather=gather, most=most)
-    one, other = (
-        instances_program(tracer._mesh, options._replace(batch=batch))(tracer._scene, *rays)
-        for batch in (False, True)
-    )
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    assert_same_at_once(tracer, rays, tracer._options(gather=gather, most=most))
 
 
 def test_rays_that_are_none_meet_nothing(few):

@@ -303,7 +303,11 @@ def test_all_rays_at_once_find_the_same(crowd):
     _, scene = crowd
     tracer = Tracer(scene, device="cpu", threads=1, instances="shared")
     rays = (*rays_through(scene, 256, 4), np.full(256, np.inf, np.float32))
-    options = tracer._options()
+    assert_same_at_once(tracer, rays, tracer._options())
+
+
+def assert_same_at_once(tracer, rays, options):
+    """Rays that are walked one by one and all at once find the same."""
     one, other = (
         instances_program(tracer._mesh, options._replace(batch=batch))(tracer._scene, *rays)
         for batch in (False, True)

@@ -40,8 +40,7 @@ from striptools.trace import Tracer, walk_single
 from striptools.trace.box import lanes_met
 from striptools.trace.launch import program
 from striptools.trace.slbvh import lay_out_slbvh
-from striptools.trace.walk import MISS, SLACK, WalkOptions, prepared_rays, ready_ray
-from striptools.trace.walk_single import nothing_yet
+from striptools.trace.walk import MISS, SLACK, WalkOptions, nothing_yet, prepared_rays, ready_ray
 from striptools.trace.walk_slbvh import Place, SlbvhScene, _State, _visit, step_in, step_out
 
 BALANCES = ("sah", "morton")

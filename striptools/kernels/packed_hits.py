@@ -6,7 +6,7 @@ from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
-from striptools.kernels.wide import LEAST_NORMAL, WIDTH
+from striptools.kernels.wide import LEAST_NORMAL, WIDTH, precedes
 
 
 @kernel
@@ -245,13 +245,6 @@ def decode_triangles(headers, words, names, count, scale_exponent, places, corne
         corners[3, i], corners[4, i], corners[5, i] = turned(y0, y1, y2, second, third)
         corners[6, i], corners[7, i], corners[8, i] = turned(z0, z1, z2, second, third)
         turns[i] = np.int32(2) if third else (np.int32(1) if second else np.int32(0))
-
-
-@inlined
-def precedes(x, y, z, other_x, other_y, other_z):
-    """Whether one corner is smaller than another by x, then y, then z."""
-    below = (y < other_y) | ((y == other_y) & (z < other_z))
-    return (x < other_x) | ((x == other_x) & below)
 
 
 @inlined

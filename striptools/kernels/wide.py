@@ -243,12 +243,16 @@ def scaled(value, scale):
 
 
 @inlined
+def precedes(x, y, z, other_x, other_y, other_z):
+    """Whether one corner is smaller than another by x, then y, then z: without branches."""
+    below = (y < other_y) | ((y == other_y) & (z < other_z))
+    return (x < other_x) | ((x == other_x) & below)
+
+
+@inlined
 def comes_before(corners, a, b):
-    """Whether corner a of a triangle is smaller than corner b by x, then y, then z."""
-    for axis in range(3):
-        if corners[a, axis] != corners[b, axis]:
-            return corners[a, axis] < corners[b, axis]
-    return False
+    """Whether corner a of a triangle, (3, 3), precedes corner b."""
+    return precedes(corners[a, 0], corners[a, 1], corners[a, 2], corners[b, 0], corners[b, 1], corners[b, 2])
 
 
 @inlined

@@ -717,11 +717,16 @@ def found_alone(scene: Any, end: Alone, any_hit: bool) -> tuple[Array, Array]:
     return _result(scene, end.ray, place, end.best, any_hit)[:2]
 
 
+def nothing_yet(ray: ReadyRay) -> Best:
+    """What a ray has found before its walk."""
+    return Best(ray.t_max, jnp.int32(MISS))
+
+
 def _nothing_found(ray: ReadyRay, options: WalkOptions) -> Found:
     """What a walk has found before it starts."""
     if options.gather is not None:
         return nothing_gathered(ray.t_max, options.most)
-    return Best(ray.t_max, jnp.int32(MISS))
+    return nothing_yet(ray)
 
 
 def _result(

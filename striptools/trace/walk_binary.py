@@ -16,13 +16,12 @@ from jax import Array, lax
 from striptools.trace.box import entries_of
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import index
-from striptools.trace.walk import DONE, SLACK, Best, Frame, ReadyRay, Traced, WalkOptions
+from striptools.trace.walk import DONE, SLACK, Best, Frame, ReadyRay, Traced, WalkOptions, nothing_yet
 from striptools.trace.walk_single import (
     BLOCK_BYTES,
     Ended,
     Leaves,
     no_counts,
-    nothing_yet,
     test_leaf,
     triangles_in_leaf,
     walk_each,

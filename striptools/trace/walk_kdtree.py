@@ -26,12 +26,11 @@ from striptools.trace.box import FAR_FACTOR
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import folded, index, larger, smaller
 from striptools.trace.triangle import crossing_of, edges_of
-from striptools.trace.walk import SLACK, Best, Frame, ReadyRay, Traced, WalkOptions
+from striptools.trace.walk import SLACK, Best, Frame, ReadyRay, Traced, WalkOptions, nothing_yet
 from striptools.trace.walk_single import (
     Ended,
     Leaves,
     is_live,
-    nothing_yet,
     test_leaf,
     triangles_in_leaf,
     walk_each,

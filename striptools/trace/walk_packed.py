@@ -187,7 +187,7 @@ class PackedScene(NamedTuple):
         """The triangles of a run, decoded, their corners along these axes."""
         assert decode is not None
         # Behind a barrier, or XLA reads it anew for every use of it.
-        header = self._settled(self._whole_row(self.headers, where.block))
+        header = self._settled(self._row(self.headers, where.block, 0, 8))
         x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         return Leaf(ax, ay, az, _first_corner(x, y, z), *self._named(where))
@@ -269,10 +269,6 @@ class PackedScene(NamedTuple):
     def _row(self, rows: Array, row: Array, first: int, count: int) -> Any:
         """Some values of a row, one after the other."""
         return lax.dynamic_slice(rows, (row, jnp.uint32(first)), (1, count))[0]
-
-    def _whole_row(self, rows: Array, row: Array) -> Any:
-        """All values of a row of eight."""
-        return self._row(rows, row, 0, 8)
 
     def _planes_of(self, node: Array) -> Any:
         """(6, 8) int32: the lanes' planes on each axis, low and high."""

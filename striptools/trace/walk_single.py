@@ -16,7 +16,6 @@ from striptools.trace.leaf_blocks import test_block, triangles_in
 from striptools.trace.numerics import in_range, index
 from striptools.trace.walk import (
     DONE,
-    MISS,
     STUCK,
     WIDTH,
     Best,
@@ -95,11 +94,6 @@ def is_live(ray: ReadyRay) -> Array:
 def no_counts() -> Counters:
     """Zeros."""
     return Counters(*(jnp.int32(0),) * KINDS)
-
-
-def nothing_yet(ray: ReadyRay) -> Best:
-    """What a ray has found before its walk."""
-    return Best(ray.t_max, jnp.int32(MISS))
 
 
 def test_leaf(leaves: Leaves, leaf: Array, ray: ReadyRay, best: Best) -> Best:

@@ -20,14 +20,13 @@ from jax import Array, lax
 from striptools.hierarchies.slbvh import AXIS, LEAF, NODE_BYTES, PRIM_COUNT, PRIM_POS
 from striptools.trace.box import passes
 from striptools.trace.counters import Counters
-from striptools.trace.walk import SLACK, Best, Frame, ReadyRay, Traced, WalkOptions
+from striptools.trace.walk import SLACK, Best, Frame, ReadyRay, Traced, WalkOptions, nothing_yet
 from striptools.trace.walk_single import (
     BLOCK_BYTES,
     Ended,
     Leaves,
     is_live,
     no_counts,
-    nothing_yet,
     test_leaf,
     triangles_in_leaf,
     walk_each,
