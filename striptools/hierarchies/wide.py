@@ -17,6 +17,7 @@ Cost: O(n) time, about 40 bytes a binary node while it runs.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -57,21 +58,41 @@ class WideTree:
     depth: int
 
 
-def collapse(tree: BinaryTree, leaf_size: int = WIDTH) -> WideTree:
-    """Collapse a binary hierarchy to the eight-wide one of least expected cost.
+class Forests(NamedTuple):
+    """The cheapest way to stand for each node of a binary hierarchy; see `kernels.wide.cheapest_forests`.
+
+    Attributes:
+        split: (2n-1, 9) int8.
+        as_leaf: (2n-1,) bool, a node alone is cheapest as a leaf.
+        cost: The expected cost of the whole tree for a ray that meets the root's box.
+    """
+
+    split: np.ndarray
+    as_leaf: np.ndarray
+    cost: float
+
+
+def cheapest(tree: BinaryTree, leaf_size: int = WIDTH) -> Forests:
+    """Find the eight-wide hierarchy of least expected cost.
 
     Args:
         tree: A preorder hierarchy over n >= 1 triangles in file order.
         leaf_size: The most triangles of a leaf, 1 to 8.
     """
-    split, as_leaf, _ = cheapest_forests(
-        tree.boxes,
-        tree.size,
-        leaf_size,
-        np.float32(WIDE_NODE_COST),
-        np.float32(LEAF_BLOCK_COST),
-        np.float32(0),
-    )
+    costs = np.float32(WIDE_NODE_COST), np.float32(LEAF_BLOCK_COST), np.float32(0)
+    split, as_leaf, cost = cheapest_forests(tree.boxes, tree.size, leaf_size, *costs)
+    return Forests(split, as_leaf, float(cost))
+
+
+def collapse(tree: BinaryTree, leaf_size: int = WIDTH, forests: Forests | None = None) -> WideTree:
+    """Collapse a binary hierarchy to the eight-wide one of least expected cost.
+
+    Args:
+        tree: As for `cheapest`.
+        leaf_size: As for `cheapest`.
+        forests: What that found, where it is known.
+    """
+    split, as_leaf, _ = forests or cheapest(tree, leaf_size)
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))
 
@@ -140,4 +161,4 @@ def _require(holds: bool, flaw: str) -> None:
         raise UnreadableSceneError(flaw, where="wide hierarchy", remedy="convert the model again")
 
 
-__all__ = ["EMPTY", "WIDTH", "WideTree", "check_wide_tree", "collapse"]
+__all__ = ["EMPTY", "WIDTH", "Forests", "WideTree", "cheapest", "check_wide_tree", "collapse"]

@@ -242,7 +242,7 @@ def _entries(scene: Scene, options: StudyOptions, tell: Watch) -> list[_Entry]:
             layout = lay_out_presorted(placed, presorted, threads, node_test=node_test)
             size, trees = presorted.nodes.nbytes, len(presorted.starts) - 1
             entries.append(_Entry(levels, node_test, size, trees, _tracer(layout, options)))
-    layout = lay_out_rebuilt(scene, threads)
+    layout = lay_out_rebuilt(scene, threads, once=True)
     return [*entries, _Entry(None, None, wide_bytes(layout), 0, _tracer(layout, options))]
 
 

@@ -15,10 +15,8 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from striptools.errors import LimitError, UsageError
-from striptools.hierarchies.in_strip import BinaryTree
-from striptools.hierarchies.wide import EMPTY, WideTree, collapse
-from striptools.kernels.hierarchy import boxes_from_below
-from striptools.partition.object_split import split_objects
+from striptools.hierarchies.rebuilt import rebuild
+from striptools.hierarchies.wide import EMPTY, WideTree
 from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
@@ -351,9 +349,9 @@ def _expanded(scene: "Scene", threads: int) -> tuple[Layout, np.ndarray]:
     trees, orders = [], []
     for g in range(len(spans)):
         part = spans.faces(g)
-        split = split_objects(boxes[part], threads=threads)
-        trees.append(collapse(BinaryTree(boxes_from_below(split.size, boxes[part][split.order]), split.size)))
-        orders.append(split.order + np.int32(part.start))
+        tree, order = rebuild(boxes[part], threads)
+        trees.append(tree)
+        orders.append(order + np.int32(part.start))
     wide, roots = joined_trees(trees)
     return lay_out_wide(scene, wide, np.concatenate(orders)), roots
 
@@ -390,9 +388,8 @@ def _packed(scene: "Scene", threads: int) -> tuple[Layout, np.ndarray]:
 def _nodes(moves: Moves, threads: int) -> tuple[WideTree, np.ndarray]:
     """The hierarchy over instances, and its nodes as the walk reads them."""
     boxes = moves.boxes.astype(np.float32)
-    split = split_objects(boxes, threads=threads)
-    wide = collapse(BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size), 1)
-    instance = split.order[wide.leaf_first]
+    wide, order = rebuild(boxes, threads, leaf_size=1)
+    instance = order[wide.leaf_first]
     leaf = (wide.child < 0) & (wide.child != EMPTY)
     child = wide.child.copy()
     child[leaf] = -(instance[-(wide.child[leaf] + 1)] + 1)

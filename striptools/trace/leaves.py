@@ -7,14 +7,12 @@ import numpy as np
 from jaxtyping import Int32
 
 from striptools.errors import LimitError
-from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.packed import wide_tree
-from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree, collapse
-from striptools.kernels.hierarchy import boxes_from_below
+from striptools.hierarchies.rebuilt import rebuild, rebuild_pieces
+from striptools.hierarchies.wide import EMPTY, WIDTH, WideTree
 from striptools.kernels.weighing import weigh_hits
 from striptools.kernels.weighing_double import block_corners
 from striptools.kernels.wide import fill_leaf_blocks
-from striptools.partition.object_split import split_objects
 from striptools.reducem.resident import size_class
 from striptools.trace.box import MARGIN
 from striptools.trace.counters import Counters
@@ -104,7 +102,13 @@ class ExpandedLayout:
 
 @dataclass(frozen=True, eq=False)
 class WideLayout(ExpandedLayout):
-    """What a tracer keeps of an expanded scene under eight-wide nodes."""
+    """What a tracer keeps of an expanded scene under eight-wide nodes.
+
+    Attributes:
+        repeats: Whether some triangle is in several leaves.
+    """
+
+    repeats: bool = False
 
     @property
     def seen_by_packets(self) -> PacketView | None:
@@ -140,12 +144,18 @@ def lay_out(scene: "Scene", threads: int = 1) -> WideLayout:
     return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
-def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1) -> WideLayout:
-    """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips."""
-    boxes = scene.triangle_boxes(threads)
-    split = split_objects(boxes, threads=threads)
-    tree = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size)
-    return lay_out_wide(scene, collapse(tree), split.order)
+def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1, *, once: bool = False) -> WideLayout:
+    """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips.
+
+    Args:
+        scene: Whose triangles they are.
+        threads: How many share the work.
+        once: Each triangle is in one leaf; else large ones are in several, which is faster to walk, but not
+            for what counts triangles.
+    """
+    if once:
+        return lay_out_wide(scene, *rebuild(scene.triangle_boxes(threads), threads))
+    return lay_out_wide(scene, *rebuild_pieces(scene.positions, scene.faces(), threads))
 
 
 def lay_out_wide(
@@ -156,13 +166,15 @@ def lay_out_wide(
     Args:
         scene: Whose triangles they are.
         wide: Its leaves are runs of places.
-        order: (n,) int32, the triangle in file order at each place; None where they are in file order.
+        order: (k,) int32, the triangle in file order at each place, k >= n where some are in several leaves;
+            None where they are in file order.
     """
     held = fill_blocks(scene, wide.leaf_first, wide.leaf_count, order)
     nodes = _nodes(wide, held.scale)
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     frame = Frame(held.scale, reach_of(scene, held.scale), zero, one, MARGIN)
-    return WideLayout(WideScene(nodes, held.blocks, frame), held, wide.depth)
+    repeats = order is not None and len(order) > scene.triangle_count
+    return WideLayout(WideScene(nodes, held.blocks, frame), held, wide.depth, repeats)
 
 
 def fill_blocks(

@@ -23,7 +23,7 @@ from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.instanced import InstancedLayout, InstanceNumbers, lay_out_instanced
 from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Found, Layout, Rays
-from striptools.trace.leaves import lay_out, lay_out_rebuilt
+from striptools.trace.leaves import WideLayout, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.walk import MISS, WalkOptions
@@ -73,8 +73,9 @@ class Tracer:
     geometries are expanded, `hierarchy` is always rebuilt.
 
     A scene under a hierarchy of its own (SLBVH, kd-tree, presorted, loose octree) is walked through that for
-    closest and any hits. All other queries go through wide nodes, rebuilt on the first of them: that call
-    takes as long as a tracer with `hierarchy` "rebuilt", and `resident_bytes` counts both from then on.
+    closest and any hits. All other queries go through wide nodes, rebuilt on the first of them, and so they
+    do where "rebuilt" has put large triangles into several leaves, since these are to be counted once: that
+    call takes as long as a tracer with `hierarchy` "rebuilt", and `resident_bytes` counts both from then on.
 
     The first call for a number of rays not met before compiles a program (seconds); it is kept in the
     user's cache folder for the next process.
@@ -85,8 +86,8 @@ class Tracer:
             compiled, a `SlowTracingWarning` says why, and its plain-JAX twin walks them, with the same hits.
         threads: CPU devices to use, at most those JAX has; None for all.
         hierarchy: "stored" walks the hierarchy that the scene holds; "rebuilt" makes a new one over single
-            triangles first, which takes longer to build, is faster to walk, and is expanded. Hits are the
-            same.
+            triangles first, which takes longer to build, is faster to walk, most where triangles are of very
+            different sizes, and is expanded. Hits are the same.
         resident: "expanded" keeps boxes and corners as float32, 65 bytes a triangle and more; "compressed"
             keeps the blocks as they are, 9 bytes and 5 of the remap, and decodes triangles where they are
             tested, which is slower. Where the scene holds its boxes ("stored"), a CPU uses all that where the
@@ -149,12 +150,30 @@ class Tracer:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
             if test != "watertight":
                 self._refuse_shared(f"triangle test {test} does not")
-        again = partial(Tracer, scene, device=device, threads=threads, hierarchy="rebuilt")
-        self._rebuild = again if scene.hierarchy is not None and hierarchy == "stored" else None
+        beside = not self._empty and not self._shared and not self._has_each_once
+        self._rebuild = partial(self._with_each_once, scene, device, threads) if beside else None
+
+    @property
+    def _has_each_once(self) -> bool:
+        """Whether what is walked is wide nodes that have each triangle in one leaf."""
+        layout = self._layout
+        return isinstance(layout.arrays, PackedScene) or (
+            isinstance(layout, WideLayout) and not layout.repeats
+        )
+
+    def _with_each_once(self, scene: "Scene", device: DeviceKind, threads: int | None) -> "Tracer":
+        """A tracer of wide nodes that have each triangle in one leaf."""
+        layout = lay_out_rebuilt(scene.placed(), self._builders(threads), once=True)
+        return Tracer.of_layout(layout, device=device, threads=threads, test=self._test)
 
     @classmethod
     def of_layout(
-        cls, layout: Layout, *, device: DeviceKind = "auto", threads: int | None = None
+        cls,
+        layout: Layout,
+        *,
+        device: DeviceKind = "auto",
+        threads: int | None = None,
+        test: TriangleTest = "watertight",
     ) -> "Tracer":
         """A tracer of what is laid out already, expanded: for studies of hierarchies that no scene holds."""
         tracer = cls.__new__(cls)
@@ -162,12 +181,12 @@ class Tracer:
         tracer._origin = np.zeros(3)
         tracer._resident, tracer._empty = "expanded", False
         tracer._shared, tracer._numbers = False, None
-        tracer._test, tracer._rebuild = "watertight", None
+        tracer._test, tracer._rebuild = test, None
         tracer._take(layout)
         return tracer
 
     _rebuild: Callable[[], "Tracer"] | None
-    """Makes the tracer of wide nodes of a scene that is walked through a hierarchy of its own."""
+    """Makes the tracer of wide nodes that have each triangle in one leaf; none of a layout alone."""
 
     def _choose(self, device: DeviceKind, threads: int | None) -> list[Any]:
         """Take the devices to trace on."""
@@ -454,13 +473,13 @@ class Tracer:
         return self if self._shared else self._wide_nodes("only closest hits and any hits")
 
     def _wide_nodes(self, refused: str) -> "Tracer":
-        """The tracer that walks wide nodes: this one, or where its walk is another, one beside it.
+        """The tracer of wide nodes that have each triangle in one leaf: this one, or one beside it.
 
         Raises:
             UsageError: There is none, naming what is `refused` to go through this layout.
         """
         self._refuse_shared(refused)
-        if self._empty or isinstance(self._layout.arrays, WideScene | PackedScene):
+        if self._empty or self._has_each_once:
             return self
         if self._rebuild is None:
             raise UsageError(
@@ -470,7 +489,7 @@ class Tracer:
 
     @cached_property
     def _rebuilt(self) -> "Tracer":
-        """The same scene under wide nodes."""
+        """The same scene under wide nodes that have each triangle in one leaf."""
         assert self._rebuild is not None
         return self._rebuild()
 
