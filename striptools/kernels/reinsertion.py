@@ -141,20 +141,24 @@ def best_place(links, x, most, search):
             search.box[0, 3 + k] = max(search.box[0, 3 + k], links.boxes[out, 3 + k])
 
 
+@inlined
+def box_anew(links, p):
+    """Box a node around its children; return whether that changed it."""
+    left, right = links.children[p, 0], links.children[p, 1]
+    changed = False
+    for k in range(3):
+        low = min(links.boxes[left, k], links.boxes[right, k])
+        high = max(links.boxes[left, 3 + k], links.boxes[right, 3 + k])
+        changed = changed or low != links.boxes[p, k] or high != links.boxes[p, 3 + k]
+        links.boxes[p, k] = low
+        links.boxes[p, 3 + k] = high
+    return changed
+
+
 @helper
 def refit(links, p):
     """Box a node and those above it anew, as far up as boxes change."""
-    while p >= 0:
-        left, right = links.children[p, 0], links.children[p, 1]
-        same = True
-        for k in range(3):
-            low = min(links.boxes[left, k], links.boxes[right, k])
-            high = max(links.boxes[left, 3 + k], links.boxes[right, 3 + k])
-            same = same and low == links.boxes[p, k] and high == links.boxes[p, 3 + k]
-            links.boxes[p, k] = low
-            links.boxes[p, 3 + k] = high
-        if same:
-            return
+    while p >= 0 and box_anew(links, p):
         p = links.parent[p]
 
 
@@ -179,7 +183,9 @@ def move(links, x, place):
     links.children[parent, 1] = x
     links.parent[place] = parent
     links.parent[x] = parent
-    refit(links, parent)
+    # Its old box was of another place: that it stays the same says nothing of those above.
+    box_anew(links, parent)
+    refit(links, links.parent[parent])
 
 
 @kernel
