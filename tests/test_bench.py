@@ -284,6 +284,21 @@ def test_quick_runs_the_quick_cases_alone(tmp_path: Path, monkeypatch: pytest.Mo
     assert measured[-1] == (["first"], BenchOptions())
 
 
+def test_what_was_measured_before_an_interruption_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    def interrupted(*_: object, **__: object) -> tuple[list[Row], list[str]]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_CLONE", clone_with(tmp_path, {"full": [[]]}))
+    monkeypatch.setattr(command, "bench", lambda *_: [Row("package", "one", 1, "file", 2.0, "B")])
+    monkeypatch.setattr(command, "run_script", interrupted)
+    file = tmp_path / "bench.csv"
+    code, _, _ = run("bench", part_of(CHANDELIER, tmp_path), "--results", file)
+    assert code == 130
+    assert [row.metric for row in rows_of(file)] == ["file"]
+
+
 def test_a_real_script_is_run(tmp_path: Path) -> None:
     (script,) = (script for script in scripts(CLONE) if script.group == "strips")
     rows, wrong = run_script(script, [part_of(CHANDELIER, tmp_path)], quick=True)

@@ -2,6 +2,7 @@
 
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -75,9 +76,9 @@ def run(
 ) -> None:
     """Measure every figure beside the installed peers, and say what got worse on this machine.
 
-    Figures are added to FILE with machine and versions. The group `package` (bytes, seconds, rays a second,
-    verification) is there wherever striptools is; a clone has a group for each script in its tests/benches.
-    Ends with 1 where a figure got worse or a script failed.
+    Figures are added to FILE with machine and versions, a group at a time. The group `package` (bytes,
+    seconds, rays a second, verification) is there wherever striptools is; a clone has a group for each script
+    in its tests/benches. Ends with 1 where a figure got worse or a script failed.
     """
     log.set_up(quiet=quiet)
     groups = _groups(only or [])
@@ -86,10 +87,14 @@ def run(
     before = last_rows(file)
     notice.before_tracing(quiet=quiet)
     begun = time.monotonic()
+    rows: list[Row] = []
+    wrong: list[str] = []
     with StageProgress(quiet=quiet) as progress:
-        rows, wrong = _measured(groups, paths, quick=quick, progress=progress)
+        # A run may take hours: what each group found is kept as soon as it is known.
+        for found, said in _measured(groups, paths, quick=quick, progress=progress):
+            append(found, file)
+            rows, wrong = rows + found, wrong + said
     seconds = time.monotonic() - begun
-    append(rows, file)
     share = tolerance / 100 if tolerance is not None else NOISE * (2 if quick else 1)
     worse = got_worse(rows, before, noise=share)
     if form == "json":
@@ -123,10 +128,8 @@ def _groups(only: list[str]) -> dict[str, Script | None]:
 
 def _measured(
     groups: dict[str, Script | None], paths: list[Path], *, quick: bool, progress: StageProgress
-) -> tuple[list[Row], list[str]]:
-    """All figures of the groups that can be measured here, and what went wrong."""
-    rows: list[Row] = []
-    wrong: list[str] = []
+) -> Iterator[tuple[list[Row], list[str]]]:
+    """The figures of each group that can be measured here, and what went wrong."""
     with tempfile.TemporaryDirectory() as folder:
         paths = paths[:1] if quick else paths
         given = [part_of(paths[0], Path(folder))] if quick and any(groups.values()) else paths
@@ -134,11 +137,9 @@ def _measured(
             progress.watch(name, done / len(groups))
             if script is None:
                 loaded = {path.stem: load_mesh(path) for path in paths}
-                rows += bench(loaded, QUICK if quick else BenchOptions())
+                yield bench(loaded, QUICK if quick else BenchOptions()), []
             elif not script.missing():
-                found, said = run_script(script, script.chosen(given), quick=quick)
-                rows, wrong = rows + found, wrong + said
-    return rows, wrong
+                yield run_script(script, script.chosen(given), quick=quick)
 
 
 def _left_out(groups: dict[str, Script | None], *, quick: bool) -> list[str]:
