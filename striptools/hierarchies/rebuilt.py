@@ -8,15 +8,10 @@ triangles that halves the expected cost, and scanned models have none.
 from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.pieces import boxes_of_pieces
 from striptools.hierarchies.reinsertion import reinsert
-from striptools.hierarchies.wide import WIDTH, Forests, WideTree, cheapest, collapse
+from striptools.hierarchies.wide import WIDTH, WideTree, cheapest, collapse
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.partition.object_split import split_objects
 from striptools.types import Boxes, Counts, FaceIds, Faces, Positions
-
-WORTH = 0.97
-"""A tree is reinserted only where that leaves at most so much of its cost: of one that saves less, rays see
-nothing (trees split from above overlap less than others of the same cost; Aila, Karras & Laine, "On Quality
-Metrics of Bounding Volume Hierarchies", HPG 2013)."""
 
 
 def rebuild(boxes: Boxes, threads: int = 1, leaf_size: int = WIDTH) -> tuple[WideTree, Counts]:
@@ -32,9 +27,9 @@ def rebuild(boxes: Boxes, threads: int = 1, leaf_size: int = WIDTH) -> tuple[Wid
     """
     split = split_objects(boxes, threads=threads)
     tree, order = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size), split.order
-    forests = cheapest(tree, leaf_size)
-    tree, order, forests = _reinserted(tree, order, forests, leaf_size)
-    return collapse(tree, leaf_size, forests), order
+    # What becomes a leaf of the wide tree stays one.
+    tree, order = reinsert(tree, order, cheapest(tree, leaf_size).as_leaf)
+    return collapse(tree, leaf_size), order
 
 
 def rebuild_pieces(positions: Positions, faces: Faces, threads: int = 1) -> tuple[WideTree, FaceIds]:
@@ -51,14 +46,3 @@ def rebuild_pieces(positions: Positions, faces: Faces, threads: int = 1) -> tupl
     boxes, triangle = boxes_of_pieces(positions, faces, threads)
     tree, order = rebuild(boxes, threads)
     return tree, triangle[order]
-
-
-def _reinserted(
-    tree: BinaryTree, order: Counts, forests: Forests, leaf_size: int
-) -> tuple[BinaryTree, Counts, Forests]:
-    """The tree with its subtrees where they cost least, if that is worth it."""
-    moved, items = reinsert(tree, order, forests.as_leaf)
-    cheaper = cheapest(moved, leaf_size)
-    if cheaper.cost > WORTH * forests.cost:
-        return tree, order, forests
-    return moved, items, cheaper

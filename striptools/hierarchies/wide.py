@@ -84,15 +84,9 @@ def cheapest(tree: BinaryTree, leaf_size: int = WIDTH) -> Forests:
     return Forests(split, as_leaf, float(cost))
 
 
-def collapse(tree: BinaryTree, leaf_size: int = WIDTH, forests: Forests | None = None) -> WideTree:
-    """Collapse a binary hierarchy to the eight-wide one of least expected cost.
-
-    Args:
-        tree: As for `cheapest`.
-        leaf_size: As for `cheapest`.
-        forests: What that found, where it is known.
-    """
-    split, as_leaf, _ = forests or cheapest(tree, leaf_size)
+def collapse(tree: BinaryTree, leaf_size: int = WIDTH) -> WideTree:
+    """Collapse a binary hierarchy, given as to `cheapest`, to the eight-wide one of least expected cost."""
+    split, as_leaf, _ = cheapest(tree, leaf_size)
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))
 
