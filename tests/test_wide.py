@@ -12,6 +12,7 @@ from strategies import clean_meshes
 from striptools.errors import UnreadableSceneError
 from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.wide import (
+    BROAD,
     EMPTY,
     LEAF_BLOCK_COST,
     WIDE_NODE_COST,
@@ -37,7 +38,7 @@ def random_tree(count, seed=0):
     return binary_tree(boxes)
 
 
-def least_cost(tree, leaf_size):
+def least_cost(tree, leaf_size, width):
     """The least expected cost by trying everything: the definition, not the algorithm."""
     area = half_area(tree.boxes)
     area = area / area[0]
@@ -48,7 +49,7 @@ def least_cost(tree, leaf_size):
     @cache
     def alone(p):
         leaf = area[p] * LEAF_BLOCK_COST if tree.size[p] <= leaf_size else np.inf
-        inner = area[p] * WIDE_NODE_COST + spread(p, WIDTH) if tree.size[p] > 1 else np.inf
+        inner = area[p] * WIDE_NODE_COST + spread(p, width) if tree.size[p] > 1 else np.inf
         return min(leaf, inner)
 
     @cache
@@ -61,13 +62,14 @@ def least_cost(tree, leaf_size):
         return alone(p) if among == 1 or tree.size[p] == 1 else min(alone(p), spread(p, among))
 
     root = WIDE_NODE_COST * area[0]
-    return root + (spread(0, WIDTH) if tree.size[0] > 1 else area[0] * LEAF_BLOCK_COST)
+    return root + (spread(0, width) if tree.size[0] > 1 else area[0] * LEAF_BLOCK_COST)
 
 
-@given(clean_meshes(), st.integers(1, 8))
-def test_collapsed_tree_is_whole(mesh, leaf_size):
+@given(clean_meshes(), st.integers(1, 8), st.sampled_from([WIDTH, BROAD]))
+def test_collapsed_tree_is_whole(mesh, leaf_size, width):
     tree, boxes = binary_tree(face_boxes(mesh.positions, mesh.faces))
-    wide = collapse(tree, leaf_size)
+    wide = collapse(tree, leaf_size, width)
+    assert wide.child.shape == (len(wide.boxes), width)
     check_wide_tree(wide, boxes)
     assert wide.leaf_count.max() <= leaf_size
     assert 1 <= wide.depth <= len(wide.boxes)
@@ -85,11 +87,28 @@ def wide_cost(tree):
     return float(WIDE_NODE_COST + (share * cost)[used].sum())
 
 
+@pytest.mark.parametrize("width", [WIDTH, BROAD])
 @pytest.mark.parametrize("leaf_size", [1, 2, 8])
 @pytest.mark.parametrize("count", [1, 2, 8, 9, 40, 200])
-def test_cost_is_the_least(count, leaf_size):
+def test_cost_is_the_least(count, leaf_size, width):
     tree, _ = random_tree(count, seed=count)
-    assert wide_cost(collapse(tree, leaf_size)) == pytest.approx(least_cost(tree, leaf_size), rel=1e-5)
+    least = least_cost(tree, leaf_size, width)
+    assert wide_cost(collapse(tree, leaf_size, width)) == pytest.approx(least, rel=1e-5)
+
+
+def test_lanes_say_on_which_side_of_the_centre_a_child_lies():
+    """Two times two times four corners of a box: sixteen children, each in the lane of its own."""
+    x, y, z = np.meshgrid([-3, -1, 1, 3], [-1, 1], [-1, 1], indexing="ij")
+    middle = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    tree, _ = binary_tree(np.concatenate([middle - 0.5, middle + 0.5], axis=1))
+    wide = collapse(tree, 1, BROAD)
+    assert len(wide.child) == 1
+    for lane in range(BROAD):
+        centre = wide.boxes[0, :3, lane] + wide.boxes[0, 3:, lane]
+        sides = (centre > 0).astype(int)
+        assert [lane >> 1 & 1, lane >> 2 & 1, lane >> 3 & 1] == sides.tolist()
+        # Of those on one side in x the lowest bit tells the outer from the inner, front to back.
+        assert lane & 1 == int(centre[0] in (6, -2))
 
 
 def test_same_input_gives_same_tree():

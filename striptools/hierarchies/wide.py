@@ -1,8 +1,9 @@
-"""Eight-wide hierarchies: the form in which the tracer walks a scene.
+"""Wide hierarchies, of 8 or 16 children a node: the form in which the tracer walks a scene.
 
 Ylitie, Karras & Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017),
-section 3.2: a dynamic programme finds, for every binary node, the cheapest way to stand for it with 1 to 7
-wide children, and from these the wide tree of least expected cost that keeps the order of the binary one.
+section 3.2: a dynamic programme finds, for every binary node, the cheapest way to stand for it with 1 child
+to one less than a node has, and from these the wide tree of least expected cost that keeps the order of the
+binary one.
 Section 3.3: the lane of a child tells on which side of its parent's centre it lies, so that a ray visits
 lanes front to back by an exclusive-or with its octant.
 
@@ -10,7 +11,8 @@ Differences:
 
 1. A leaf is one block of up to eight triangles tested at once, so its cost does not depend on how many it
    holds.
-2. Lanes are given to children greedily, the best fit first, not by an auction.
+2. Lanes are given to children greedily, the best fit first, not by an auction; of sixteen, a fourth bit says
+   on which side of the half along x.
 3. Boxes stay float32.
 
 Cost: O(n) time, about 40 bytes a binary node while it runs.
@@ -24,15 +26,15 @@ from jaxtyping import Float32, Int32
 
 from striptools.errors import UnreadableSceneError
 from striptools.hierarchies.in_strip import BinaryTree
-from striptools.kernels.wide import EMPTY, WIDTH, cheapest_forests, emit_wide
+from striptools.kernels.wide import BROAD, EMPTY, WIDTH, cheapest_forests, emit_wide
 from striptools.types import Boxes, Counts
 
-WideBoxes = Float32[np.ndarray, "w 6 8"]
-WideCorners = Float32[np.ndarray, "w 3 8"]
-WideChildren = Int32[np.ndarray, "w 8"]
+WideBoxes = Float32[np.ndarray, "w 6 k"]
+WideCorners = Float32[np.ndarray, "w 3 k"]
+WideChildren = Int32[np.ndarray, "w k"]
 
 WIDE_NODE_COST = 1.0
-"""Expected time of a visit to a wide node: eight boxes at once."""
+"""Expected time of a visit to a wide node: all boxes at once."""
 
 LEAF_BLOCK_COST = 1.0
 """Expected time of testing a leaf, in visits to a wide node: up to eight triangles at once."""
@@ -40,12 +42,12 @@ LEAF_BLOCK_COST = 1.0
 
 @dataclass(frozen=True, eq=False)
 class WideTree:
-    """A hierarchy whose nodes have up to eight children and whose leaves are runs of triangles in file order.
+    """A hierarchy whose nodes have up to k children and whose leaves are runs of triangles in file order.
 
     Attributes:
-        boxes: (w, 6, 8) float32, lo xyz and hi xyz of each lane's child; inverted (inf, -inf) in empty lanes.
-        child: (w, 8) int32: a node (>= 0, after its parent; the root is 0), a leaf q as -(q + 1), or
-            `EMPTY` = -2**31.
+        boxes: (w, 6, k) float32, lo xyz and hi xyz of each lane's child; inverted (inf, -inf) in empty lanes.
+        child: (w, k) int32, k 8 or 16: a node (>= 0, after its parent; the root is 0), a leaf q as -(q + 1),
+            or `EMPTY` = -2**31.
         leaf_first: (l,) int32, the first triangle of each leaf.
         leaf_count: (l,) int32, 1 to 8 triangles of each leaf.
         depth: The most nodes on a way from the root down.
@@ -62,7 +64,7 @@ class Forests(NamedTuple):
     """The cheapest way to stand for each node of a binary hierarchy; see `kernels.wide.cheapest_forests`.
 
     Attributes:
-        split: (2n-1, 9) int8.
+        split: (2n-1, k + 1) int8.
         as_leaf: (2n-1,) bool, a node alone is cheapest as a leaf.
         cost: The expected cost of the whole tree for a ray that meets the root's box.
     """
@@ -72,21 +74,22 @@ class Forests(NamedTuple):
     cost: float
 
 
-def cheapest(tree: BinaryTree, leaf_size: int = WIDTH) -> Forests:
-    """Find the eight-wide hierarchy of least expected cost.
+def cheapest(tree: BinaryTree, leaf_size: int = WIDTH, width: int = WIDTH) -> Forests:
+    """Find the wide hierarchy of least expected cost.
 
     Args:
         tree: A preorder hierarchy over n >= 1 triangles in file order.
         leaf_size: The most triangles of a leaf, 1 to 8.
+        width: Children of a node, 8 or 16.
     """
     costs = np.float32(WIDE_NODE_COST), np.float32(LEAF_BLOCK_COST), np.float32(0)
-    split, as_leaf, cost = cheapest_forests(tree.boxes, tree.size, leaf_size, *costs)
+    split, as_leaf, cost = cheapest_forests(tree.boxes, tree.size, width, leaf_size, *costs)
     return Forests(split, as_leaf, float(cost))
 
 
-def collapse(tree: BinaryTree, leaf_size: int = WIDTH) -> WideTree:
-    """Collapse a binary hierarchy, given as to `cheapest`, to the eight-wide one of least expected cost."""
-    split, as_leaf, _ = cheapest(tree, leaf_size)
+def collapse(tree: BinaryTree, leaf_size: int = WIDTH, width: int = WIDTH) -> WideTree:
+    """Collapse a binary hierarchy, given as to `cheapest`, to the wide one of least expected cost."""
+    split, as_leaf, _ = cheapest(tree, leaf_size, width)
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))
 
@@ -119,7 +122,7 @@ def _check_links(tree: WideTree) -> None:
     lanes = np.flatnonzero(child >= 0)
     nodes = child[lanes]
     _require(np.array_equal(np.sort(nodes), np.arange(1, len(tree.child))), "a node has not one parent")
-    _require(bool((nodes > lanes // WIDTH).all()), "a node comes before its parent")
+    _require(bool((nodes > lanes // tree.child.shape[1]).all()), "a node comes before its parent")
     leaves = -(child[(child < 0) & (child != EMPTY)] + 1)
     _require(np.array_equal(np.sort(leaves), np.arange(len(tree.leaf_first))), "a leaf has not one parent")
 
@@ -155,4 +158,4 @@ def _require(holds: bool, flaw: str) -> None:
         raise UnreadableSceneError(flaw, where="wide hierarchy", remedy="convert the model again")
 
 
-__all__ = ["EMPTY", "WIDTH", "Forests", "WideTree", "cheapest", "check_wide_tree", "collapse"]
+__all__ = ["BROAD", "EMPTY", "WIDTH", "Forests", "WideTree", "cheapest", "check_wide_tree", "collapse"]

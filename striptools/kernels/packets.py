@@ -171,11 +171,11 @@ def ready_packets(
         row[0], row[1], row[2], row[3] = s0, s1, u0, u1
         row[4], row[5], row[6], row[7] = x0, x1, y0, y1
         row[8], row[9], row[10], row[11] = z1, z0, deepest, margin
-        mirror = np.int32(7) ^ (np.int32(mx < ZERO) | np.int32(my < ZERO) << 1 | np.int32(mz < ZERO) << 2)
+        octant = np.int32(7) ^ (np.int32(mx < ZERO) | np.int32(my < ZERO) << 1 | np.int32(mz < ZERO) << 2)
         words[count, 12] = x
         words[count, 13] = y
         words[count, 14] = z | (4 if away else 0)
-        words[count, 15] = mirror
+        words[count, 15] = octant
 
         # Write the rays; lanes that have none repeat the first, with nothing to reach.
         for k in range(PACKET):

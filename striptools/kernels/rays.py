@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from striptools.kernels.compiled import helper, kernel
-from striptools.kernels.wide import EMPTY, WIDTH
+from striptools.kernels.wide import BROAD, EMPTY
 
 ROW = 24
 """Words of a ready ray: 17 float32, then 7 int32; see `trace.walk`."""
@@ -20,7 +20,7 @@ LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 FAR_FACTOR = np.float32(1 + 2**-21)
 TINY = np.float32(2**-60)
 SLACK = np.float32(1 + 2**-20)
-HIGHEST_BIT = np.array([max(k.bit_length() - 1, 0) for k in range(2**WIDTH)], np.uint8)
+HIGHEST_BIT = np.array([max(k.bit_length() - 1, 0) for k in range(2**BROAD)], np.uint8)
 
 
 @kernel
@@ -58,7 +58,7 @@ def steep(way):
 def lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, limit, mirror):
     """The root's lanes that a ray meets, as bits in the order of visits, the nearest highest."""
     lanes = np.int32(0)
-    for lane in range(WIDTH):
+    for lane in range(root.shape[1]):
         ax = root[0, lane] * ix - lx
         ay = root[1, lane] * iy - ly
         az = root[2, lane] * iz - lz
@@ -85,9 +85,9 @@ def ready_rays(
         which: (m,) int32, the rays to take; (0,) for all of them.
         begin: The first of them to take.
         frame: `trace.walk.Frame` as float32 and arrays of three: scale, reach, low, unit, margin.
-        root: (>= 6, 8) float32, the boxes of the root's children, counted from low and in units; NaN in empty
-            lanes; other rows are not read.
-        children: (8,) int32, the root's children.
+        root: (>= 6, k) float32, k 8 or 16, the boxes of the root's children, counted from low and in units;
+            NaN in empty lanes; other rows are not read.
+        children: (k,) int32, the root's children.
         visit: Whether to visit the root here; else every valid ray starts at it.
         rays: (k, 24) float32, written, a row for each ray that has something to visit.
         words: The same memory as int32.
@@ -132,8 +132,8 @@ def ready_rays(
 
         # Make the constants of the slab test.
         margin = margin_unit * larger(largest, reach)
-        mirror = np.int32(7)
-        mirror ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
+        octant = np.int32(7)
+        octant ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
         ix, iy, iz = ONE / steep(dx), ONE / steep(dy), ONE / steep(dz)
         lx = flushed(flushed(flushed(ox + margin) - low[0]) * ix)
         ly = flushed(flushed(flushed(oy + margin) - low[1]) * iy)
@@ -147,6 +147,7 @@ def ready_rays(
         child = np.int32(0)
         lanes = np.int32(0)
         if visit:
+            mirror = octant << 1 | octant & 1 if len(children) == BROAD else octant
             lanes = lanes_met(root, lx, ly, lz, hx, hy, hz, ix, iy, iz, far * SLACK, mirror)
             if lanes == 0:
                 dropped[r] = 1
@@ -156,7 +157,7 @@ def ready_rays(
             lanes ^= np.int32(1) << order
         dropped[r] = 0
 
-        # Write the row: slab, shear, distances, then axes, mirror and the place to start from.
+        # Write the row: slab, shear, distances, then axes, octant and the place to start from.
         z = 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
@@ -181,7 +182,7 @@ def ready_rays(
         words[count, 17] = x
         words[count, 18] = y
         words[count, 19] = z
-        words[count, 20] = mirror
+        words[count, 20] = octant
         words[count, 21] = child ^ EMPTY
         words[count, 22] = lanes
         words[count, 23] = 1 if visit else 0

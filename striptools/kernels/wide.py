@@ -1,11 +1,14 @@
-"""Kernels of the collapse of a binary hierarchy to eight-wide nodes, and of the tracer's leaf blocks."""
+"""Kernels of the collapse of a binary hierarchy to nodes of 8 or 16 children, and of leaf blocks."""
 
 import numpy as np
 
 from striptools.kernels.compiled import helper, inlined, kernel
 
 WIDTH = 8
-"""Children of a wide node and triangles of a leaf block: the float32 lanes of one AVX register."""
+"""Children of a node of a scene file and triangles of a leaf block: the float32 lanes of one AVX register."""
+
+BROAD = 16
+"""Children of a node of a hierarchy that is made for a CPU: a quarter fewer steps, which wait for memory."""
 
 LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 
@@ -23,12 +26,13 @@ def half_area(boxes, p):
 
 
 @kernel
-def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
-    """For each binary node, the cheapest way to stand for it with at most 1 to 8 wide children.
+def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_price):
+    """For each binary node, the cheapest way to stand for it with at most 1 to `width` wide children.
 
     Args:
         boxes: (2n-1, 6) float32, preorder.
         size: (2n-1,) int32, triangles below each node.
+        width: Children of a node, `WIDTH` or `BROAD`.
         leaf_size: The most triangles of a leaf.
         node_cost: The cost of visiting a wide node.
         leaf_cost: The cost of testing a leaf, full or not.
@@ -36,14 +40,15 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
             worth another node.
 
     Returns:
-        split: (2n-1, 9) int8; `split[p, j]`, j >= 2, says how many of j children the left subtree gets, 0
-            means that fewer than j are as cheap; `split[p, 8]` is the split of p as a wide node of its own.
+        split: (2n-1, width + 1) int8; `split[p, j]`, j >= 2, says how many of j children the left subtree
+            gets, 0 means that fewer than j are as cheap; `split[p, width]` is the split of p as a wide node
+            of its own.
         as_leaf: (2n-1,) bool, p standing alone is cheapest as a leaf.
         cost: The expected cost of the whole tree for a ray that meets the root's box, and the prices.
     """
     count = len(size)
-    cost = np.empty((count, WIDTH), np.float32)
-    split = np.zeros((count, WIDTH + 1), np.int8)
+    cost = np.empty((count, width), np.float32)
+    split = np.zeros((count, width + 1), np.int8)
     as_leaf = np.zeros(count, np.bool_)
     root = half_area(boxes, 0)
     unit = 1.0 / root if root > 0.0 else 1.0
@@ -53,19 +58,19 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
         # Let a single triangle be a leaf however many children are on offer.
         if size[p] == 1:
             as_leaf[p] = True
-            for j in range(1, WIDTH):
+            for j in range(1, width):
                 cost[p, j] = area * leaf_cost
             continue
 
-        # Find the cheapest way to give eight children to the two subtrees.
+        # Find the cheapest way to give all children to the two subtrees.
         left = p + 1
         right = p + 2 * size[left]
         best = np.float32(np.inf)
-        for k in range(1, WIDTH):
-            c = cost[left, k] + cost[right, WIDTH - k]
+        for k in range(1, width):
+            c = cost[left, k] + cost[right, width - k]
             if c < best or k == 1:
                 best = c
-                split[p, WIDTH] = k
+                split[p, width] = k
 
         # Choose between a wide node and, where the triangles are few enough, a leaf.
         inner = best + area * node_cost + node_price
@@ -76,8 +81,8 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
         else:
             cost[p, 1] = inner
 
-        # Offer two to seven children, unless fewer are as cheap.
-        for j in range(2, WIDTH):
+        # Offer two children and more, unless fewer are as cheap.
+        for j in range(2, width):
             best = cost[p, j - 1]
             for k in range(1, j):
                 c = cost[left, k] + cost[right, j - k]
@@ -91,10 +96,11 @@ def cheapest_forests(boxes, size, leaf_size, node_cost, leaf_cost, node_price):
 @helper
 def gather_children(p, size, split, nodes, budget, children):
     """Write the binary nodes that become the children of the wide node at p, in order; return how many."""
+    width = split.shape[1] - 1
     nodes[0] = p + 2 * size[p + 1]
-    budget[0] = WIDTH - split[p, WIDTH]
+    budget[0] = width - split[p, width]
     nodes[1] = p + 1
-    budget[1] = split[p, WIDTH]
+    budget[1] = split[p, width]
     held = 2
     found = 0
     while held > 0:
@@ -116,9 +122,23 @@ def gather_children(p, size, split, nodes, budget, children):
     return found
 
 
+@inlined
+def fit_of(x, y, z, lane, width):
+    """How well a child so far from its node's centre lies in a lane.
+
+    The bits of a lane say on which side of the centre it lies, x lowest. Of sixteen lanes one bit below those
+    says on which side of the half; along which axis makes no difference.
+    """
+    if width == BROAD:
+        x = x * (1.5 if (lane ^ lane >> 1) & 1 == 0 else 0.5)
+        lane >>= 1
+    return (x if lane & 1 else -x) + (y if lane & 2 else -y) + (z if lane & 4 else -z)
+
+
 @helper
 def assign_lanes(boxes, p, children, found, lane_of):
-    """Give each child of p a lane, whose bits say on which side of p's centre it lies; best fits first."""
+    """Give each child of p one of the lanes, of which `lane_of` has as many; best fits first."""
+    width = len(lane_of)
     taken = 0
     for i in range(found):
         lane_of[i] = -1
@@ -130,15 +150,13 @@ def assign_lanes(boxes, p, children, found, lane_of):
             if lane_of[i] >= 0:
                 continue
             c = children[i]
-            for lane in range(WIDTH):
+            x = np.float64(boxes[c, 0]) + boxes[c, 3] - boxes[p, 0] - boxes[p, 3]
+            y = np.float64(boxes[c, 1]) + boxes[c, 4] - boxes[p, 1] - boxes[p, 4]
+            z = np.float64(boxes[c, 2]) + boxes[c, 5] - boxes[p, 2] - boxes[p, 5]
+            for lane in range(width):
                 if (taken >> lane) & 1:
                     continue
-                fit = 0.0
-                for axis in range(3):
-                    side = (
-                        np.float64(boxes[c, axis]) + boxes[c, axis + 3] - boxes[p, axis] - boxes[p, axis + 3]
-                    )
-                    fit += side if (lane >> axis) & 1 else -side
+                fit = fit_of(x, y, z, lane, width)
                 if fit > best or best_child < 0:
                     best = fit
                     best_child = i
@@ -152,24 +170,25 @@ def emit_wide(boxes, size, split, as_leaf):
     """Lay out the wide nodes that `cheapest_forests` chose.
 
     Returns:
-        wide_boxes: (w, 6, 8) float32, lo xyz and hi xyz by lane, inverted (inf, -inf) in empty lanes.
-        child: (w, 8) int32, a node, -(leaf + 1), or EMPTY; a node comes after its parent.
+        wide_boxes: (w, 6, width) float32, lo xyz and hi xyz by lane, inverted (inf, -inf) in empty lanes.
+        child: (w, width) int32, a node, -(leaf + 1), or EMPTY; a node comes after its parent.
         leaf_first, leaf_count: (l,) int32, the run of triangles of each leaf.
         depth: The most nodes on a way from the root to a leaf.
     """
+    width = split.shape[1] - 1
     limit = max(1, len(size) // 2)
-    wide_boxes = np.empty((limit, 6, WIDTH), np.float32)
-    child = np.full((limit, WIDTH), EMPTY, np.int32)
+    wide_boxes = np.empty((limit, 6, width), np.float32)
+    child = np.full((limit, width), EMPTY, np.int32)
     source = np.empty(limit, np.int32)
     level = np.empty(limit, np.int32)
     start = np.empty(limit, np.int32)
     leaf_first = np.empty(len(size) // 2 + 1, np.int32)
     leaf_count = np.empty(len(size) // 2 + 1, np.int32)
-    pending = np.empty(limit + WIDTH, np.int32)
-    nodes = np.empty(4 * WIDTH, np.int64)
-    budget = np.empty(4 * WIDTH, np.int64)
-    children = np.empty(WIDTH, np.int64)
-    lane_of = np.empty(WIDTH, np.int64)
+    pending = np.empty(limit + width, np.int32)
+    nodes = np.empty(4 * width, np.int64)
+    budget = np.empty(4 * width, np.int64)
+    children = np.empty(width, np.int64)
+    lane_of = np.empty(width, np.int64)
     source[0] = 0
     level[0] = 1
     start[0] = 0

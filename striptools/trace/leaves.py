@@ -119,7 +119,7 @@ class WideLayout(ExpandedLayout):
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
-        """(6, 8) float32 boxes of the root's children, NaN where there is none, and (8,) int32 children."""
+        """(7, k) float32, boxes of the root's children, NaN where there is none, and (k,) int32 children."""
         node = self.arrays.nodes[0]
         return node, node[6].view(np.int32)
 
@@ -144,7 +144,9 @@ def lay_out(scene: "Scene", threads: int = 1) -> WideLayout:
     return lay_out_wide(scene, wide_tree(scene.with_boxes(threads), boxes, scene.block_starts))
 
 
-def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1, *, once: bool = False) -> WideLayout:
+def lay_out_rebuilt(
+    scene: "Scene | Placed", threads: int = 1, *, once: bool = False, width: int = WIDTH
+) -> WideLayout:
     """Lay a scene out for the walk through a new SAH hierarchy over its triangles, whatever their strips.
 
     Args:
@@ -152,10 +154,11 @@ def lay_out_rebuilt(scene: "Scene | Placed", threads: int = 1, *, once: bool = F
         threads: How many share the work.
         once: Each triangle is in one leaf; else large ones are in several, which is faster to walk, but not
             for what counts triangles.
+        width: Children of a node, 8, or 16 for a CPU.
     """
     if once:
-        return lay_out_wide(scene, *rebuild(scene.triangle_boxes(threads), threads))
-    return lay_out_wide(scene, *rebuild_pieces(scene.positions, scene.faces(), threads))
+        return lay_out_wide(scene, *rebuild(scene.triangle_boxes(threads), threads, width=width))
+    return lay_out_wide(scene, *rebuild_pieces(scene.positions, scene.faces(), threads, width=width))
 
 
 def lay_out_wide(
@@ -219,7 +222,7 @@ def _names(scene: "Scene | Placed", count: int) -> tuple[Int32[np.ndarray, " n"]
 def _nodes(wide: WideTree, scale: np.float32) -> np.ndarray:
     """Wide nodes as the walk reads them: scaled, empty lanes not a number, padded to a size class."""
     count = len(wide.boxes)
-    nodes = aligned_full((size_class(count + 1), 7, WIDTH), np.nan)
+    nodes = aligned_full((size_class(count + 1), 7, wide.child.shape[1]), np.nan)
     np.multiply(wide.boxes, scale, out=nodes[:count, :6])
     np.copyto(nodes[:count, :6], np.nan, where=(wide.child == EMPTY)[:, None])
     children = nodes[:, 6].view(np.int32)

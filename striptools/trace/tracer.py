@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.kernels.wide import BROAD, WIDTH
 from striptools.threads import in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
@@ -163,7 +164,7 @@ class Tracer:
 
     def _with_each_once(self, scene: "Scene", device: DeviceKind, threads: int | None) -> "Tracer":
         """A tracer of wide nodes that have each triangle in one leaf."""
-        layout = lay_out_rebuilt(scene.placed(), self._builders(threads), once=True)
+        layout = lay_out_rebuilt(scene.placed(), self._builders(threads), once=True, width=self._width)
         return Tracer.of_layout(layout, device=device, threads=threads, test=self._test)
 
     @classmethod
@@ -205,7 +206,12 @@ class Tracer:
             return lay_out_packed(scene, threads)
         if hierarchy == "stored":
             return lay_out(scene, threads)
-        return lay_out_rebuilt(scene.placed(), threads)
+        return lay_out_rebuilt(scene.placed(), threads, width=self._width)
+
+    @property
+    def _width(self) -> int:
+        """Children of a node of a hierarchy that is made here: 16 on a CPU, 8 for a GPU's kernel."""
+        return WIDTH if self._on_gpu else BROAD
 
     def _builders(self, threads: int | None) -> int:
         """Threads to build with: as many as trace on a CPU; beside a GPU, two unless one was asked for."""

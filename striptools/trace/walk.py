@@ -1,4 +1,4 @@
-"""The walk of rays through an eight-wide hierarchy: a function of a few rays, compiled to one native loop.
+"""The walk of rays through a wide hierarchy: a function of a few rays, compiled to one native loop.
 
 What nodes and leaves look like is the scene's affair (`WalkScene`): `walk_wide` has boxes and corners in
 float32, `walk_packed` the compressed blocks of a scene file.
@@ -10,7 +10,8 @@ Differences:
 
 1. A few rays go side by side in one instruction stream, so that one's arithmetic fills the other's waits:
    two on a CPU, one on a GPU. Leaves are visited as soon as one of them is at one.
-2. Leaves are tested eight triangles at once; hits are looked at one by one only where there are any.
+2. Nodes have 8 children, or 16 where a hierarchy is made for a CPU. Leaves are tested eight triangles at
+   once; hits are looked at one by one only where there are any.
 3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
    the same t the one of the smaller face is kept: the result does not depend on the order of visits.
 
@@ -31,6 +32,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Int32
 
+from striptools.kernels.wide import WIDTH
 from striptools.trace.box import Slab, slab_of
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import (
@@ -50,7 +52,6 @@ from striptools.trace.triangle_tests import Triangles, crossings_by, wants_way
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 from striptools.types import TriangleTest
 
-WIDTH = 8
 FLOATS = 17
 """Float32 words at the head of a ready ray; int32 words follow."""
 
@@ -162,6 +163,11 @@ class WalkScene(Protocol):
         ...
 
     @property
+    def width(self) -> int:
+        """Children of a node: `WIDTH` or `BROAD`."""
+        ...
+
+    @property
     def has_faces(self) -> bool:
         """Whether names are triangles in file order, and faces something else."""
         ...
@@ -171,17 +177,17 @@ class WalkScene(Protocol):
         ...
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
-        """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
+        """(width,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         ...
 
     def boxes_of(self, node: Array) -> Array:
-        """(6, 8) float32: the boxes of a node's children, lo xyz and hi xyz, scaled; NaN in empty lanes."""
+        """(6, width) float32: boxes of a node's children, lo xyz and hi xyz, scaled; NaN in empty lanes."""
         ...
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane: a node, or a negative number other than `DONE` that names a leaf.
 
-        `DONE` for the last node and a lane above 7, which are at the bottom of each stack.
+        `DONE` for the last node and a lane that no node has, which are at the bottom of each stack.
         """
         ...
 
@@ -277,9 +283,9 @@ class ReadyRay(NamedTuple):
 
     Attributes:
         floats: (17,) float32: what the properties name; (20,) where the direction follows.
-        ints: (7,) int32: axes of the shear, mirror, and where the walk starts: exclusive-or of `DONE` and
+        ints: (7,) int32: axes of the shear, octant, and where the walk starts: exclusive-or of `DONE` and
             the child to visit first (zeros are a ray that is done), the root's lanes left, nodes visited.
-        lane_bits: (8,) int32, the bit that stands for each lane, the nearest highest.
+        lane_bits: (width,) int32, the bit that stands for each lane, the nearest highest.
     """
 
     floats: Array
@@ -313,8 +319,8 @@ class ReadyRay(NamedTuple):
 
     @property
     def mirror(self) -> Array:
-        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
-        return self.ints[3]
+        """See `mirror_of`."""
+        return mirror_of(self.ints[3], len(self.lane_bits))
 
     @property
     def start(self) -> "Place":
@@ -332,8 +338,25 @@ class Mirrored(Protocol):
 
     @property
     def mirror(self) -> Array:
-        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
+        """See `mirror_of`."""
         ...
+
+
+def mirror_of(octant: Any, width: int) -> Any:
+    """Exclusive-or of a lane and its place in the order of visits, the nearest highest.
+
+    Args:
+        octant: Seven, less a bit for each axis along which the ray goes down, x lowest.
+        width: Children of a node; of sixteen lanes the lowest bit says a side along x again.
+    """
+    return octant if width == WIDTH else octant << 1 | octant & 1
+
+
+def lane_bits_of(octant: Array, width: int) -> Array:
+    """(width,) int32: the bit that stands for each lane, the nearest highest: a row of a constant table."""
+    octants, lanes = np.arange(8, dtype=np.int32)[:, None], np.arange(width, dtype=np.int32)
+    table = jnp.asarray(np.int32(1) << (lanes ^ mirror_of(octants, width)))
+    return lax.dynamic_slice(table, (index(octant), jnp.uint32(0)), (1, width))[0]
 
 
 class Place(NamedTuple):
@@ -411,7 +434,7 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
 
 def _floor(scene: Any, options: WalkOptions) -> Array:
     """An empty stack: its bottom has a lane that no node has."""
-    bottom = jnp.array([scene.node_count - 1, 256], jnp.int32)
+    bottom = jnp.array([scene.node_count - 1, 1 << scene.width], jnp.int32)
     return jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
 
 
@@ -423,13 +446,13 @@ def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root
     return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)])
 
 
-def ready_ray(row: Array) -> ReadyRay:
-    """The ray that a row says."""
+def ready_ray(row: Array, width: int = WIDTH) -> ReadyRay:
+    """The ray that a row says, for nodes of so many children."""
     ints = lax.bitcast_convert_type(row[FLOATS:WORDS], jnp.int32)
     floats = row[:FLOATS]
     if len(row) > WORDS:
         floats = jnp.concatenate([floats, row[WORDS:]])
-    return ReadyRay(floats, ints, jnp.int32(1) << (jnp.arange(WIDTH, dtype=jnp.int32) ^ ints[3]))
+    return ReadyRay(floats, ints, lane_bits_of(ints[3], width))
 
 
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
@@ -442,7 +465,7 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     shorten, length = power_of_two_below(longest)
     origin, direction, finite = scaled_ray(frame, origin, direction)
     valid = finite & (longest >= np.finfo(np.float32).tiny) & (t_max > 0)
-    mirror = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
+    octant = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
     slab = slab_of(origin, direction, frame)
     shear = shear_of(origin, direction)
     rest = [
@@ -457,7 +480,7 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
     start = jnp.where(valid, DONE, 0)
     zero = jnp.int32(0)
     axes = (axis.astype(jnp.int32) for axis in shear.axes)
-    return floats, jnp.stack([*axes, mirror, start, zero, zero])
+    return floats, jnp.stack([*axes, octant, start, zero, zero])
 
 
 def largest_of(vector: Array) -> Array:
@@ -654,7 +677,7 @@ def _walk_group(
     scene: WalkScene, group: Array, stacks: tuple[Array, ...], options: WalkOptions
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
-    rays = tuple(ready_ray(row) for row in group)
+    rays = tuple(ready_ray(row, scene.width) for row in group)
     state, bests = _walked(
         _Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays)
     )
@@ -703,7 +726,7 @@ def walk_alone(
         options: What to compile in.
         nothing: What the ray has found before; None for no triangle.
     """
-    ray = ready_ray(row)
+    ray = ready_ray(row, scene.width)
     best = _nothing_found(ray, options) if nothing is None else nothing(ray)
     state, bests = _walked(_Walk(scene, (ray,), options), (_floor(scene, options),), (best,))
     visits = state.visits[0] if state.visits else jnp.zeros(3, jnp.int32)

@@ -187,6 +187,11 @@ class _Seen(NamedTuple):
         return self.scene.frame
 
     @property
+    def width(self) -> int:
+        """Children of a node."""
+        return WIDTH
+
+    @property
     def node_count(self) -> int:
         """Nodes over instances."""
         return len(self.scene.nodes)

@@ -40,6 +40,7 @@ from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.walk import (
     DONE,
+    WIDTH,
     Best,
     Decode,
     Frame,
@@ -93,6 +94,11 @@ class PackedScene(NamedTuple):
     top_count: Any
     scale_exponent: Any
     frame: Frame
+
+    @property
+    def width(self) -> int:
+        """Children of a node."""
+        return WIDTH
 
     @property
     def node_count(self) -> int:

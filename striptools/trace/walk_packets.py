@@ -35,7 +35,6 @@ from striptools.trace.walk import (
     MISS,
     SLACK,
     STUCK,
-    WIDTH,
     Best,
     Decode,
     Leaf,
@@ -43,6 +42,8 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     WalkScene,
+    lane_bits_of,
+    mirror_of,
     nearer,
     next_child,
 )
@@ -83,7 +84,7 @@ class _Packet(NamedTuple):
 
     Attributes:
         bounds: (13,) float32, what the properties name.
-        ints: (10,) int32: axes, mirror, and the rows of a node's boxes.
+        ints: (10,) int32: axes, octant, and the rows of a node's boxes.
         rays: (8, 32) float32: origin along the axes, shear, t_max in t of the walk, -1 in a lane without a
             ray, and t of the walk in units of the caller's.
     """
@@ -123,8 +124,8 @@ class _Packet(NamedTuple):
         return index(self.ints[0]), index(self.ints[1]), index(self.ints[2])
 
     @property
-    def mirror(self) -> Array:
-        """Exclusive-or of a lane and its place in the order of visits, nearest 7."""
+    def octant(self) -> Array:
+        """Of the rays, see `walk.mirror_of`."""
         return self.ints[3]
 
     @property
@@ -171,7 +172,7 @@ def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Trac
     Returns:
         Of the rays of each packet, (p, 32).
     """
-    bottom = jnp.array([scene.node_count - 1, 256], jnp.int32)
+    bottom = jnp.array([scene.node_count - 1, 1 << scene.width], jnp.int32)
     stack = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
 
     def walk(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -318,7 +319,7 @@ def _limit(packet: _Packet, t: Array) -> Array:
 
 def _box_of(scene: PacketScene, packet: _Packet, place: Place) -> _Box:
     """The box of the leaf at hand, as its node has it."""
-    lane = place.lane ^ index(packet.mirror)
+    lane = place.lane ^ index(mirror_of(packet.octant, scene.width))
     x0, x1, y0, y1, z0, z1 = scene.sides_in(place.node, packet.rows, lane)
     return _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
 
@@ -339,8 +340,8 @@ def _walk_packet(
     scene: PacketScene, packet: _Packet, stack: Array, options: WalkOptions
 ) -> tuple[Array, tuple[Array, Array]]:
     """Walk one packet; its stack serves the next."""
-    turn = _Turn(packet.mirror)
-    lane_bits = jnp.int32(1) << (jnp.arange(WIDTH, dtype=jnp.int32) ^ packet.mirror)
+    turn = _Turn(mirror_of(packet.octant, scene.width))
+    lane_bits = lane_bits_of(packet.octant, scene.width)
 
     def visit_node(state: _State, limit: Array) -> _State:
         place = state.place

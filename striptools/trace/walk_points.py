@@ -31,8 +31,6 @@ from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, WIDTH, Decode, Lea
 FARTHEST = np.float32(2.0**60)
 """The largest scaled coordinate of a point that can be looked from: squares stay finite."""
 
-VISITS_A_NODE = 1 + WIDTH
-
 Vector = tuple[Array, Array, Array]
 
 
@@ -90,14 +88,15 @@ def _walk(scene: WalkScene, point: Array, stack: Array, options: PointOptions) -
     at = (point[0], point[1], point[2])
     size = larger(larger(jnp.abs(at[0]), jnp.abs(at[1])), larger(jnp.abs(at[2]), scene.frame.reach))
     margin = scene.frame.margin * size
-    root = jnp.array([0, 2**WIDTH - 1], jnp.int32)
+    root = jnp.array([0, 2**scene.width - 1], jnp.int32)
     stack = lax.dynamic_update_slice(stack, root[None], (jnp.uint32(0), jnp.uint32(0)))
     height = jnp.where(point[3] > 0, jnp.int32(1), jnp.int32(0))
     none = (jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME, DONE, np.int32(0)))
     nothing = Nearest(*none)
 
     def goes_on(state: _State) -> Array:
-        return (state.height > 0) & (state.turns <= VISITS_A_NODE * scene.node_count)
+        # A node is visited once for each child, and left.
+        return (state.height > 0) & (state.turns <= (1 + scene.width) * scene.node_count)
 
     def turn(state: _State) -> _State:
         return _turn(scene, at, margin, state, options.decode)
@@ -117,17 +116,17 @@ def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: De
     top = index(state.height - 1)
     node, lanes = lax.dynamic_slice(state.stack, (top, jnp.uint32(0)), (1, 2))[0]
     squares = box_squares(scene.boxes_of(node), at, margin)
-    left = (lanes >> jnp.arange(WIDTH, dtype=jnp.int32) & 1 != 0) & (squares <= state.nearest.square)
+    order = jnp.arange(scene.width, dtype=jnp.int32)
+    left = (lanes >> order & 1 != 0) & (squares <= state.nearest.square)
     squares = jnp.where(left, squares, jnp.float32(jnp.inf))
     least = folded(squares, smaller)
-    order = jnp.arange(WIDTH, dtype=jnp.int32)
-    lane = folded(jnp.where(left & (squares == least), order, jnp.int32(WIDTH)), smaller)
-    some = lane < WIDTH
+    lane = folded(jnp.where(left & (squares == least), order, jnp.int32(scene.width)), smaller)
+    some = lane < scene.width
     lane = jnp.where(some, lane, 0)
     child = jnp.where(some, scene.child_of(node, index(lane)), DONE)
     rest = jnp.stack([node, lanes ^ jnp.where(some, jnp.int32(1) << lane, 0)])
     stack = lax.dynamic_update_slice(state.stack, rest[None], (top, jnp.uint32(0)))
-    below = jnp.stack([child, jnp.int32(2**WIDTH - 1)])
+    below = jnp.stack([child, jnp.int32(2**scene.width - 1)])
     height = state.height + jnp.where(some, jnp.where(child >= 0, 1, 0), -1)
     # Where there is no child that is a node this writes above the stack's top, where nothing is.
     above = index(jnp.where(child >= 0, state.height, len(stack) - 1))
@@ -141,7 +140,7 @@ def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: De
 
 
 def box_squares(boxes: Array, at: Vector, margin: Array) -> Array:
-    """(8,) float32: squares of the distances from a point to boxes (6, 8), at most the true ones."""
+    """(k,) float32: squares of the distances from a point to boxes (6, k), at most the true ones."""
     total = jnp.zeros(boxes.shape[1:], jnp.float32)
     for axis in range(3):
         outside = larger(boxes[axis] - at[axis], at[axis] - boxes[axis + 3]) - margin

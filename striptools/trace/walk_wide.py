@@ -11,7 +11,6 @@ from striptools.trace.leaf_blocks import leaf_in, test_block, triangles_in
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
-    WIDTH,
     Best,
     Decode,
     Frame,
@@ -28,8 +27,8 @@ class WideScene(NamedTuple):
     """A scene as arrays on a device; sizes are padded so that scenes of like size share a compiled program.
 
     Attributes:
-        nodes: (w, 7, 8) float32, six rows of boxes, NaN in empty lanes, then the bits of the children (int32,
-            as in `WideTree`, `DONE` in empty lanes). The last node has no children.
+        nodes: (w, 7, k) float32, k 8 or 16, six rows of boxes, NaN in empty lanes, then the bits of the
+            children (int32, as in `WideTree`, `DONE` in empty lanes). The last node has no children.
         blocks: (l, 10, 8) float32, of each leaf's triangles by lane: x of corners a, b, c, then y, then z,
             NaN in empty lanes; then the bits of their faces (int32). A leaf is 320 bytes in a row.
         frame: How rays are seen: boxes are counted from zero, in ones.
@@ -45,6 +44,11 @@ class WideScene(NamedTuple):
         return len(self.nodes)
 
     @property
+    def width(self) -> int:
+        """Children of a node."""
+        return self.nodes.shape[-1]
+
+    @property
     def has_faces(self) -> bool:
         """The way from a face to its triangle is on the host."""
         return False
@@ -54,13 +58,13 @@ class WideScene(NamedTuple):
         return names
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
-        """(8,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
+        """(k,) bool: the node's children whose boxes the ray meets, from 0 to `limit`."""
         return lanes_met(self.boxes_of(node), slab, limit)
 
     def boxes_of(self, node: Array) -> Array:
-        """(6, 8) float32: the boxes of a node's children, scaled; NaN in empty lanes."""
+        """(6, k) float32: the boxes of a node's children, scaled; NaN in empty lanes."""
         at = (index(node), jnp.uint32(0), jnp.uint32(0))
-        return lax.dynamic_slice(self.nodes, at, (1, 6, WIDTH))[0]
+        return lax.dynamic_slice(self.nodes, at, (1, 6, self.width))[0]
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; leaf q is -(q + 1)."""
@@ -92,7 +96,7 @@ class WideScene(NamedTuple):
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""
         at = index(node)
-        sides = [lax.dynamic_slice(self.nodes, (at, row, jnp.uint32(0)), (1, 1, WIDTH)) for row in rows]
+        sides = [lax.dynamic_slice(self.nodes, (at, row, jnp.uint32(0)), (1, 1, self.width)) for row in rows]
         return [side[0, 0] for side in sides]
 
     def sides_in(self, node: Array, rows: tuple[Array, ...], lane: Array) -> list[Array]:
@@ -108,8 +112,9 @@ class WideScene(NamedTuple):
         return triangles_in(self.blocks, where)
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
-        """A node is eight boxes and 224 bytes, a leaf 320 bytes."""
-        return Counters(nodes, leaves, nodes * 8, triangles, nodes * 224, leaves * 320)
+        """A box is 28 bytes with its child, a leaf 320."""
+        boxes = nodes * self.width
+        return Counters(nodes, leaves, boxes, triangles, boxes * 28, leaves * 320)
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
