@@ -52,3 +52,16 @@ def rebuild_pieces(
     boxes, triangle = boxes_of_pieces(positions, faces, threads)
     tree, order = rebuild(boxes, threads, width=width)
     return tree, triangle[order]
+
+
+# Notes
+#
+# A power plant, 2.6 million triangles, rates of rays over those through the object split alone (camera in
+# packets, one by one, occlusion, any hit, random): cut 3.2, 3.5, 1.8, 1.5, 1.4; cut and reinserted 2.3, 3.6,
+# 2.3, 2.0, 1.8, in 5.8 s for 2.4; with all nodes reinserted instead of the largest fifth 3.8, 4.7, 2.4, 2.1,
+# 1.9, in 15 s; cut twice as often 3.6, 5.0, 2.5, 2.2, 1.9, but scans are cut then, and lose 1 to 3 %. A board
+# (kicad_acepack): camera 1.3 to 1.6, random 1.1, occlusion 0.98; a maple 1.05 to 1.18; scans nothing, and
+# reinserted by force a camera's rays lose 4 % for an expected gain of 2 %.
+#
+# Left out: the same for the nodes over a file's blocks. Their area falls by 23 % on the power plant and the
+# board; rates 0.7 (camera) and 1.1 (occlusion) on the one, 1.4 to 1.7 and 0.98 on the other.
