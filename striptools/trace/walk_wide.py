@@ -150,11 +150,11 @@ class WideScene(NamedTuple):
 # closest hit, in the place of eight lanes: 244 instructions a leaf for 437, and the same time.
 #
 # Sixteen children in the place of eight (rebuilt; dragon, dragon_3m5, power plant): 0.73 to 0.75 of the
-# nodes, and rates of 1.03 to 1.09 (camera, one by one), 1.07 to 1.12 (occlusion), 1.09 to 1.11 (any hit), 1.08
-# to 1.10 (random rays), 1.0 (packets). Lane bits have to come from a table: shifted by an octant they compile
-# to sixteen scalar shifts a ray, 3 %. No gain over that: the fourth bit along y, z, (1, 1, 1), or four diagonals
-# for four axes; children exchanged after the greedy choice of lanes; a node cost of 1.4; registers of 512
-# bits. With one ray 0.87 to 1.0 of two, with four 0.96.
+# nodes, and rates of 1.03 to 1.09 (camera, one by one), 1.07 to 1.12 (occlusion), 1.09 to 1.11 (any hit),
+# 1.08 to 1.10 (random rays), 1.0 (packets). Lane bits have to come from a table: shifted by an octant they
+# compile to sixteen scalar shifts a ray, 3 %. No gain over that: the fourth bit along y, z, (1, 1, 1), or
+# four diagonals for four axes; children exchanged after the greedy choice of lanes; a node cost of 1.4;
+# registers of 512 bits. With one ray 0.87 to 1.0 of two, with four 0.96.
 #
 # Not worth a stack that holds distances, counted: children left out when they are farther than a hit found
 # since save 5 % of the nodes of occlusion rays, 13 % of a camera's one by one; children sorted by distance
