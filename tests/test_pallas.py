@@ -17,6 +17,7 @@ from striptools.hierarchies.options import HierarchyOptions
 from striptools.mesh.mesh import Mesh
 from striptools.threads import in_chunks
 from striptools.trace import SlowTracingWarning, Tracer, launch
+from striptools.trace.leaves import lay_out_rebuilt
 from striptools.trace.pallas import walk as kernel
 from striptools.trace.walk import DONE, STUCK, WalkOptions, prepared_rays, walk_rays
 
@@ -107,7 +108,7 @@ def tree_as_deep_as_can_be():
 
 def test_a_deep_stack_is_kept():
     scene = tree_as_deep_as_can_be()
-    tracer = Tracer(scene, device="cpu", threads=1, hierarchy="rebuilt")
+    tracer = Tracer.of_layout(lay_out_rebuilt(scene), device="cpu", threads=1)
     # From beyond the last, past it: every node's other children wait on the stack until the first was seen.
     origins = np.zeros((COUNT, 3), np.float32)
     directions = np.tile(np.array([[1, 0, 0]], np.float32), (COUNT, 1))
@@ -126,6 +127,14 @@ def test_a_deep_stack_is_kept():
         for size in (options.stack_size, 8)
     )
     assert (np.asarray(full.name) != np.asarray(short.name)).any()
+
+
+def test_nodes_of_sixteen_children_are_refused():
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1, hierarchy="rebuilt")
+    ready = jax.jit(prepared_rays)(tracer._scene, *odd_rays(scene))
+    with pytest.raises(NotImplementedError, match="nodes of 16 children"):
+        walked(partial(kernel.walk_rays, interpret=True), tracer, ready, options_of(tracer))
 
 
 def test_a_fault_in_the_kernel_would_be_seen(monkeypatch):

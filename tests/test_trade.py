@@ -126,7 +126,7 @@ def test_each_way_of_tracing_is_traced(mesh: Mesh) -> None:
     of = {setting.name: setting for setting in settings(Options())}
     for name in ("traced hierarchy: rebuilt", "box precision: 4 bits"):
         nodes = bench._tracer(bench.scene, of[name])._layout.arrays.nodes
-        assert nodes.shape[1:] == stored.shape[1:]
+        assert nodes.shape[1] == stored.shape[1]
         assert not np.array_equal(nodes, stored, equal_nan=True)
 
 

@@ -65,11 +65,16 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, *, interpret
     """Walk r rays, r a multiple of `RAYS`, as `walk.walk_rays` does.
 
     Args:
-        scene: Wide or packed, of fewer than `MOST_NODES` nodes.
+        scene: Wide or packed, of fewer than `MOST_NODES` nodes of eight children.
         ready: (r, 24) float32, as from `walk.prepared_rays`.
         options: What to compile in: nothing counted or gathered; `interleave` and `batch` do not matter.
         interpret: Run the kernel by JAX on the platform at hand, slowly.
+
+    Raises:
+        NotImplementedError: The scene has other nodes, or more of them.
     """
+    if scene.width != WIDTH:
+        raise NotImplementedError(f"nodes of {scene.width} children")
     if scene.node_count > MOST_NODES:
         raise NotImplementedError(f"more than {MOST_NODES} nodes")
     count, source = len(ready), source_of(scene)
