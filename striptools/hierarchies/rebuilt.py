@@ -8,7 +8,7 @@ triangles that halves the expected cost, and scanned models have none.
 from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.pieces import boxes_of_pieces
 from striptools.hierarchies.reinsertion import reinsert
-from striptools.hierarchies.wide import WIDTH, WideTree, cheapest, collapse
+from striptools.hierarchies.wide import WIDTH, WideTree, cheapest, emit
 from striptools.kernels.hierarchy import boxes_from_below
 from striptools.partition.object_split import split_objects
 from striptools.types import Boxes, Counts, FaceIds, Faces, Positions
@@ -31,8 +31,9 @@ def rebuild(
     split = split_objects(boxes, threads=threads)
     tree, order = BinaryTree(boxes_from_below(split.size, boxes[split.order]), split.size), split.order
     # What becomes a leaf of the wide tree stays one.
-    tree, order = reinsert(tree, order, cheapest(tree, leaf_size, width).as_leaf)
-    return collapse(tree, leaf_size, width), order
+    forests = cheapest(tree, leaf_size, width)
+    moved, order = reinsert(tree, order, forests.as_leaf)
+    return emit(moved, forests if moved is tree else cheapest(moved, leaf_size, width)), order
 
 
 def rebuild_pieces(

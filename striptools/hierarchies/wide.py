@@ -89,7 +89,12 @@ def cheapest(tree: BinaryTree, leaf_size: int = WIDTH, width: int = WIDTH) -> Fo
 
 def collapse(tree: BinaryTree, leaf_size: int = WIDTH, width: int = WIDTH) -> WideTree:
     """Collapse a binary hierarchy, given as to `cheapest`, to the wide one of least expected cost."""
-    split, as_leaf, _ = cheapest(tree, leaf_size, width)
+    return emit(tree, cheapest(tree, leaf_size, width))
+
+
+def emit(tree: BinaryTree, forests: Forests) -> WideTree:
+    """Lay out the wide hierarchy that `cheapest` found."""
+    split, as_leaf, _ = forests
     boxes, child, first, count, depth = emit_wide(tree.boxes, tree.size, split, as_leaf)
     return WideTree(boxes, child, first, count, int(depth))
 
@@ -158,4 +163,14 @@ def _require(holds: bool, flaw: str) -> None:
         raise UnreadableSceneError(flaw, where="wide hierarchy", remedy="convert the model again")
 
 
-__all__ = ["BROAD", "EMPTY", "WIDTH", "Forests", "WideTree", "cheapest", "check_wide_tree", "collapse"]
+__all__ = [
+    "BROAD",
+    "EMPTY",
+    "WIDTH",
+    "Forests",
+    "WideTree",
+    "cheapest",
+    "check_wide_tree",
+    "collapse",
+    "emit",
+]
