@@ -140,7 +140,9 @@ def determinant_signs(matrix: np.ndarray) -> np.ndarray:
         terms = [a[:, i] * (b[:, j] * c[:, k]) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
         terms += [-(a[:, i] * (b[:, j] * c[:, k])) for i, j, k in ((0, 2, 1), (1, 0, 2), (2, 1, 0))]
         value, size = sum(terms), sum(map(np.abs, terms))
-        sure = (np.abs(value) > np.maximum(SURE * size, LEAST_SURE)) & np.isfinite(size)
+        # What an inner product loses below the least float64 is multiplied by an entry of the first row.
+        least = LEAST_SURE * np.maximum(np.abs(a).max(axis=1), 1)
+        sure = (np.abs(value) > np.maximum(SURE * size, least)) & np.isfinite(size)
     signs = np.where(sure, np.sign(np.where(sure, value, 0)), 0).astype(np.int8)
     for row in np.flatnonzero(~sure):
         signs[row] = _exact_sign(matrix[row, :3])
