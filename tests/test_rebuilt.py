@@ -109,13 +109,13 @@ def test_triangles_of_one_size_stay_whole():
     np.testing.assert_array_equal(triangle, np.arange(len(faces)))
 
 
-def linked(tree, kept=None):
+def linked(tree):
     """A tree linked both ways, and room for searches."""
     nodes = len(tree.size)
     links = kernels.Links(
         np.zeros(nodes, np.int32), np.zeros((nodes, 2), np.int32), np.zeros((nodes, 6), np.float32)
     )
-    kernels.link(tree.size, tree.boxes, np.zeros(nodes, bool) if kept is None else kept, links)
+    kernels.link(tree.size, tree.boxes, np.zeros(nodes, bool), links)
     return links, kernels.Search(np.zeros(4096, np.int32), np.zeros(4096), np.zeros((1, 6), np.float32))
 
 

@@ -14,6 +14,12 @@ def half_area(lo_x, lo_y, lo_z, hi_x, hi_y, hi_z):
     return x * y + y * z + z * x
 
 
+@inlined
+def area_of(boxes, p):
+    """Half the surface area of one of (n, 6) boxes."""
+    return half_area(boxes[p, 0], boxes[p, 1], boxes[p, 2], boxes[p, 3], boxes[p, 4], boxes[p, 5])
+
+
 @kernel
 def face_boxes(positions, faces, begin, end, boxes):
     """Fill boxes (n, 6) with the bounds of the three corners of the faces `begin:end`."""

@@ -136,10 +136,10 @@ def piece_boxes(positions, faces, cuts, low, extent, boxes, triangle):
     Returns:
         How many parts there are.
     """
-    most = cuts.max() + 2
-    waiting = np.empty((most, CORNERS, 3))
-    corners = np.empty(most, np.int64)
-    left = np.empty(most, np.int64)
+    room = cuts.max() + 2
+    waiting = np.empty((room, CORNERS, 3))
+    corners = np.empty(room, np.int64)
+    left = np.empty(room, np.int64)
     below = np.empty((CORNERS, 3))
     above = np.empty((CORNERS, 3))
     whole = np.empty(6)
@@ -169,14 +169,11 @@ def piece_boxes(positions, faces, cuts, low, extent, boxes, triangle):
             # Write the box of a part that stays whole, rounded outwards.
             if axis < 0:
                 for k in range(3):
-                    near = np.float32(max(box[k] - slack, whole[k]))
-                    far = np.float32(min(box[3 + k] + slack, whole[3 + k]))
-                    if near > max(box[k] - slack, whole[k]):
-                        near = np.nextafter(near, np.float32(-np.inf))
-                    if far < min(box[3 + k] + slack, whole[3 + k]):
-                        far = np.nextafter(far, np.float32(np.inf))
-                    boxes[parts, k] = near
-                    boxes[parts, 3 + k] = far
+                    least = max(box[k] - slack, whole[k])
+                    most = min(box[3 + k] + slack, whole[3 + k])
+                    near, far = np.float32(least), np.float32(most)
+                    boxes[parts, k] = np.nextafter(near, np.float32(-np.inf)) if near > least else near
+                    boxes[parts, 3 + k] = np.nextafter(far, np.float32(np.inf)) if far < most else far
                 triangle[parts] = face
                 parts += 1
                 continue

@@ -7,7 +7,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from striptools.kernels.boxes import half_area
+from striptools.kernels.boxes import area_of, half_area
 from striptools.kernels.compiled import helper, inlined, kernel
 
 Links = namedtuple("Links", "parent children boxes")
@@ -16,12 +16,6 @@ Links = namedtuple("Links", "parent children boxes")
 
 Search = namedtuple("Search", "node saved box")
 """Room: node (k,) int32 and saved (k,) float64 of places to look at, and box (1, 6) float32."""
-
-
-@inlined
-def area(boxes, p):
-    """Half the surface area of a box."""
-    return half_area(boxes[p, 0], boxes[p, 1], boxes[p, 2], boxes[p, 3], boxes[p, 4], boxes[p, 5])
 
 
 @inlined
@@ -91,13 +85,13 @@ def best_place(links, x, most, search):
     Returns:
         The node, -1 where none saves anything, and the half area saved over all nodes.
     """
-    own = area(links.boxes, x)
+    own = area_of(links.boxes, x)
     there = sibling(links, x)
     pivot = links.parent[x]
     best = 0.0
     place = np.int32(-1)
     # With x goes its parent; the boxes above shrink to what `search.box` holds.
-    saved = area(links.boxes, pivot)
+    saved = area_of(links.boxes, pivot)
     for k in range(6):
         search.box[0, k] = links.boxes[there, k]
     out = there
@@ -118,7 +112,7 @@ def best_place(links, x, most, search):
             if gain > best and node != there:
                 best = gain
                 place = node
-            below = gain + area(links.boxes, node)
+            below = gain + area_of(links.boxes, node)
             if below - own > best and links.children[node, 0] >= 0 and held + 2 <= len(search.node):
                 search.node[held] = links.children[node, 0]
                 search.node[held + 1] = links.children[node, 1]
@@ -129,11 +123,11 @@ def best_place(links, x, most, search):
         if links.parent[pivot] < 0 or looked >= most:
             return place, best
         if pivot != links.parent[x]:
-            saved -= area(search.box, 0)
+            saved -= area_of(search.box, 0)
             if saved > best:
                 best = saved
                 place = pivot
-            saved += area(links.boxes, pivot)
+            saved += area_of(links.boxes, pivot)
         out = sibling(links, pivot)
         pivot = links.parent[pivot]
         for k in range(3):
@@ -209,7 +203,7 @@ def move_each(links, nodes, least, most, search):
         if parent < 0 or links.parent[parent] < 0:
             continue
         place, gain = best_place(links, x, most, search)
-        if place >= 0 and gain > least * area(links.boxes, parent):
+        if place >= 0 and gain > least * area_of(links.boxes, parent):
             move(links, x, place)
             moved += 1
             saved += gain
@@ -222,7 +216,7 @@ def inner_area(links):
     total = 0.0
     for p in range(len(links.parent)):
         if (p == 0 or links.parent[p] >= 0) and links.children[p, 0] >= 0:
-            total += area(links.boxes, p)
+            total += area_of(links.boxes, p)
     return total
 
 
@@ -231,7 +225,7 @@ def areas(links, nodes):
     """Half areas of nodes, (k,) float64."""
     found = np.empty(len(nodes))
     for k in range(len(nodes)):
-        found[k] = area(links.boxes, nodes[k])
+        found[k] = area_of(links.boxes, nodes[k])
     return found
 
 

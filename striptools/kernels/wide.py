@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from striptools.kernels.boxes import area_of
 from striptools.kernels.compiled import helper, inlined, kernel
 
 WIDTH = 8
@@ -14,15 +15,6 @@ LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 
 EMPTY = np.int32(-(2**31))
 """The child of an empty lane."""
-
-
-@kernel
-def half_area(boxes, p):
-    """Half the surface area of one box, in float64: finite for all finite boxes."""
-    dx = np.float64(boxes[p, 3]) - boxes[p, 0]
-    dy = np.float64(boxes[p, 4]) - boxes[p, 1]
-    dz = np.float64(boxes[p, 5]) - boxes[p, 2]
-    return dx * dy + dy * dz + dz * dx
 
 
 @kernel
@@ -50,10 +42,10 @@ def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_p
     cost = np.empty((count, width), np.float32)
     split = np.zeros((count, width + 1), np.int8)
     as_leaf = np.zeros(count, np.bool_)
-    root = half_area(boxes, 0)
+    root = area_of(boxes, 0)
     unit = 1.0 / root if root > 0.0 else 1.0
     for p in range(count - 1, -1, -1):
-        area = np.float32(half_area(boxes, p) * unit)
+        area = np.float32(area_of(boxes, p) * unit)
 
         # Let a single triangle be a leaf however many children are on offer.
         if size[p] == 1:
