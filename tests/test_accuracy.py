@@ -20,7 +20,7 @@ from test_hoisting import loops_outside_hoisted_calls
 from test_trace import flushed
 
 from striptools.errors import UsageError
-from striptools.kernels.rays import ROW, add_ways, ready_rays
+from striptools.kernels.rays import ROW, ready_rays
 from striptools.measure.bound import frame_rays, judge_pairs
 from striptools.measure.exact import exact_pair
 from striptools.measure.verify import VerifyOptions, VerifyReport, verify
@@ -382,7 +382,6 @@ def test_rows_of_the_host_are_those_of_the_device(ball) -> None:
         np.zeros(500, np.uint8),
     )
     live, _ = ready_rays(origins, directions, reach, *given_to)
-    add_ways(directions, at[:live], rows, rows.view(np.int32))
     np.testing.assert_array_equal(rows[:live, WORDS:], device[at[:live], WORDS:])
     np.testing.assert_array_equal(rows[:live, :FLOATS], device[at[:live], :FLOATS])
 

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
-from striptools.kernels.rays import ROW, add_ways, ready_rays
+from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import aligned_full
@@ -194,8 +194,6 @@ def _send_each(
     while begin < count:
         rows, at = pipe.room()
         live, begin = ready_rays(*rays, which, begin, *seen, True, rows, rows.view(np.int32), at, dropped)
-        if rows.shape[1] > ROW:
-            add_ways(rays[1], at[:live], rows, rows.view(np.int32))
         yield from pipe.fill(live)
 
 
