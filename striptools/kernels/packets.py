@@ -2,13 +2,28 @@
 
 Source: the frustum of a packet is that of Reshetov, Soupikov & Hurley, "Multi-Level Ray Tracing Algorithm",
 SIGGRAPH 2005; here slopes along the rays' dominant axis bound it, so that no direction component divides.
+
+The rays of a packet are readied together, in rows of one number each, so that the arithmetic runs over whole
+registers.
 """
 
 import numpy as np
 from numba import njit
 
 from striptools.kernels.compiled import inlined
-from striptools.kernels.rays import LARGEST, LEAST_NORMAL, ONE, ZERO, flushed, larger, picked
+from striptools.kernels.rays import (
+    LEAST_NORMAL,
+    ONE,
+    ZERO,
+    flushed,
+    is_ray,
+    larger,
+    longest_axis,
+    longest_of,
+    picked,
+    scaled_by,
+    smaller,
+)
 
 PACKET = 32
 """Rays of a packet: the lanes of four AVX registers."""
@@ -19,6 +34,19 @@ HEAD = 16
 ROW = HEAD + 8 * PACKET
 """Words of a packet."""
 
+START, SLOPE, REACH, BACK = 0, 3 * PACKET, 6 * PACKET, 7 * PACKET
+"""Where in a room are the rows that a packet has: see `walk_packets`."""
+
+DEPTH, LARGEST_OF, VALID, SAME = 8 * PACKET, 9 * PACKET, 10 * PACKET, 11 * PACKET
+"""Size of the direction along the dominant axis, the origin's largest coordinate, whether there is a ray,
+and whether it goes the way of the packet."""
+
+ORIGIN, WAY, FAR_OF = 12 * PACKET, 15 * PACKET, 18 * PACKET
+"""Rays as they were given."""
+
+FOLD = 19 * PACKET
+ROOM = 20 * PACKET
+
 WIDER = np.float32(2.0**-21)
 """How much slopes are moved outward: they were rounded, and products with them are."""
 
@@ -26,17 +54,126 @@ FAR = np.float32(3.0e38)
 
 
 @inlined
-def is_ray(ox, oy, oz, dx, dy, dz, far):
-    """Whether a scaled origin, a direction and a reach make a ray."""
-    finite = (abs(ox) <= LARGEST) & (abs(oy) <= LARGEST) & (abs(oz) <= LARGEST)
-    finite &= (abs(dx) <= LARGEST) & (abs(dy) <= LARGEST) & (abs(dz) <= LARGEST)
-    return finite & (larger(larger(abs(dx), abs(dy)), abs(dz)) >= LEAST_NORMAL) & (far > ZERO)
+def take(origins, directions, t_max, begin, held, room):
+    """Gather `held` rays into a room, and zeros behind them."""
+    for k in range(PACKET):
+        r = begin + min(k, held - 1)
+        for axis in range(3):
+            room[ORIGIN + axis * PACKET + k] = origins[r, axis]
+            room[WAY + axis * PACKET + k] = directions[r, axis]
+        room[FAR_OF + k] = t_max[r] if k < held else ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def prepare(room, scale, x, y, z, away):
+    """Fill all other rows of a room, for rays whose dominant axis and side are said."""
+    for k in range(PACKET):
+        # Scale the ray by powers of two; mark what is no ray, or goes another way.
+        ox = flushed(flushed(room[ORIGIN + k]) * scale)
+        oy = flushed(flushed(room[ORIGIN + PACKET + k]) * scale)
+        oz = flushed(flushed(room[ORIGIN + 2 * PACKET + k]) * scale)
+        dx = flushed(room[WAY + k])
+        dy = flushed(room[WAY + PACKET + k])
+        dz = flushed(room[WAY + 2 * PACKET + k])
+        far = flushed(room[FAR_OF + k])
+        room[VALID + k] = ONE if is_ray(ox, oy, oz, dx, dy, dz, far) else ZERO
+        shorten, length = scaled_by(longest_of(dx, dy, dz))
+        dx, dy, dz = flushed(dx * shorten), flushed(dy * shorten), flushed(dz * shorten)
+        depth = picked(dx, dy, dz, z)
+        same = (longest_axis(dx, dy, dz) == z) & ((depth < ZERO) == away)
+        room[SAME + k] = ONE if same else ZERO
+        room[START + k] = picked(ox, oy, oz, x)
+        room[START + PACKET + k] = picked(ox, oy, oz, y)
+        room[START + 2 * PACKET + k] = picked(ox, oy, oz, z)
+        room[SLOPE + k] = flushed(picked(dx, dy, dz, x) / depth)
+        room[SLOPE + PACKET + k] = flushed(picked(dx, dy, dz, y) / depth)
+        room[SLOPE + 2 * PACKET + k] = ONE / depth
+        room[REACH + k] = flushed(flushed(far * length) * scale)
+        room[BACK + k] = flushed(shorten / scale)
+        room[DEPTH + k] = abs(depth)
+        room[LARGEST_OF + k] = longest_of(ox, oy, oz)
 
 
 @inlined
-def longest_axis(dx, dy, dz):
-    """The dominant axis of a direction."""
-    return 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
+def gather_live(room, lane_of):
+    """Move the rays of a room to its front, and repeat the first behind them, with nothing to reach.
+
+    Returns:
+        How many rays there are; and whether all go the way of the packet.
+    """
+    full, along = np.int32(0), np.int32(0)
+    for k in range(PACKET):
+        full += np.int32(room[VALID + k] != ZERO)
+        along += np.int32(room[SAME + k] != ZERO)
+        lane_of[k] = k
+    if full == PACKET:
+        return PACKET, along == PACKET
+    live, same = 0, True
+    for k in range(PACKET):
+        if room[VALID + k] != ZERO:
+            same &= room[SAME + k] != ZERO
+            for row in range(10):
+                room[row * PACKET + live] = room[row * PACKET + k]
+            lane_of[live] = k
+            live += 1
+    for k in range(live, PACKET):
+        for row in range(10):
+            room[row * PACKET + k] = room[row * PACKET]
+        room[REACH + k] = -ONE
+    return live, same
+
+
+@inlined
+def least(room, row):
+    """The least number of a row."""
+    for k in range(16):
+        room[FOLD + k] = smaller(room[row + k], room[row + 16 + k])
+    for k in range(8):
+        room[FOLD + k] = smaller(room[FOLD + k], room[FOLD + 8 + k])
+    for k in range(4):
+        room[FOLD + k] = smaller(room[FOLD + k], room[FOLD + 4 + k])
+    return smaller(smaller(room[FOLD], room[FOLD + 1]), smaller(room[FOLD + 2], room[FOLD + 3]))
+
+
+@inlined
+def most(room, row):
+    """The largest number of a row."""
+    for k in range(16):
+        room[FOLD + k] = larger(room[row + k], room[row + 16 + k])
+    for k in range(8):
+        room[FOLD + k] = larger(room[FOLD + k], room[FOLD + 8 + k])
+    for k in range(4):
+        room[FOLD + k] = larger(room[FOLD + k], room[FOLD + 4 + k])
+    return larger(larger(room[FOLD], room[FOLD + 1]), larger(room[FOLD + 2], room[FOLD + 3]))
+
+
+@inlined
+def way_of(directions, r):
+    """The dominant axis of a ray's direction and its side, as one number; -1 where it has none."""
+    dx, dy, dz = flushed(directions[r, 0]), flushed(directions[r, 1]), flushed(directions[r, 2])
+    if not (longest_of(dx, dy, dz) >= LEAST_NORMAL):
+        return -1
+    z = longest_axis(dx, dy, dz)
+    return 2 * z + (1 if picked(dx, dy, dz, z) < ZERO else 0)
+
+
+@inlined
+def part_ways(directions, begin, end):
+    """Whether a few of the rays show that they do not all go the same way."""
+    way = way_of(directions, (begin + end) >> 1)
+    apart = False
+    for k in (begin, (3 * begin + end) >> 2, (begin + 3 * end) >> 2, end - 1):
+        other = way_of(directions, k)
+        apart |= (way >= 0) & (other >= 0) & (other != way)
+    return apart
+
+
+@inlined
+def send_alone(begin, end, single, alone):
+    """Write rays down as going on their own; return how many do."""
+    for k in range(begin, end):
+        single[alone + k - begin] = k
+    return alone + end - begin
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -64,19 +201,21 @@ def ready_packets(
         The packets written, the rays that go on their own, and the first ray not taken.
     """
     scale, reach, margin_unit = seen
-    room, count, alone = len(packets), 0, 0
-    start = np.zeros((3, PACKET), np.float32)
-    slope = np.zeros((3, PACKET), np.float32)
-    rest = np.zeros((3, PACKET), np.float32)
+    count, alone = 0, 0
+    room = np.zeros(ROOM, np.float32)
     lane_of = np.zeros(PACKET, np.int32)
     r = begin
     while r < len(origins):
-        if count == room or alone + PACKET > len(single):
+        if count == len(packets) or alone + PACKET > len(single):
             return count, alone, r
-        end = min(r + PACKET, len(origins))
+        begin, end = r, min(r + PACKET, len(origins))
+        r = end
+        if part_ways(directions, begin, end):
+            alone = send_alone(begin, end, single, alone)
+            continue
 
         # Take the axis and the side of the middle ray for that of all.
-        middle = (r + end) >> 1
+        middle = (begin + end) >> 1
         mx = flushed(directions[middle, 0])
         my = flushed(directions[middle, 1])
         mz = flushed(directions[middle, 2])
@@ -84,78 +223,45 @@ def ready_packets(
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
         away = picked(mx, my, mz, z) < ZERO
-
-        # Scale rays by powers of two; refuse what is no ray; stop at one that goes another way.
-        live, same, largest = 0, True, reach
-        for k in range(r, end):
-            ox = flushed(flushed(origins[k, 0]) * scale)
-            oy = flushed(flushed(origins[k, 1]) * scale)
-            oz = flushed(flushed(origins[k, 2]) * scale)
-            dx, dy, dz = flushed(directions[k, 0]), flushed(directions[k, 1]), flushed(directions[k, 2])
-            far = flushed(t_max[k])
-            if not is_ray(ox, oy, oz, dx, dy, dz, far):
-                dropped[k] = 2
-                continue
-            dropped[k] = 0
-            longest = np.float32(larger(larger(abs(dx), abs(dy)), abs(dz)))
-            exponent = min(max(longest.view(np.int32) >> 23, 1), 253)
-            shorten = np.int32((254 - exponent) << 23).view(np.float32)
-            length = np.int32(exponent << 23).view(np.float32)
-            dx, dy, dz = flushed(dx * shorten), flushed(dy * shorten), flushed(dz * shorten)
-            depth = picked(dx, dy, dz, z)
-            if (longest_axis(dx, dy, dz) != z) | ((depth < ZERO) != away):
-                same = False
-                break
-            start[0, live] = picked(ox, oy, oz, x)
-            start[1, live] = picked(ox, oy, oz, y)
-            start[2, live] = picked(ox, oy, oz, z)
-            slope[0, live] = flushed(picked(dx, dy, dz, x) / depth)
-            slope[1, live] = flushed(picked(dx, dy, dz, y) / depth)
-            slope[2, live] = ONE / depth
-            rest[0, live] = flushed(flushed(far * length) * scale)
-            rest[1, live] = flushed(shorten / scale)
-            rest[2, live] = abs(depth)
-            largest = larger(largest, larger(larger(abs(ox), abs(oy)), abs(oz)))
-            lane_of[live] = k
-            live += 1
+        take(origins, directions, t_max, begin, end - begin, room)
+        prepare(room, scale, x, y, z, away)
+        live, same = gather_live(room, lane_of)
+        if not same:
+            alone = send_alone(begin, end, single, alone)
+            continue
+        for k in range(begin, end):
+            dropped[k] = 2
+        for k in range(live):
+            dropped[begin + lane_of[k]] = 0
+        if live == 0:
+            continue
 
         # Bound origins and slopes; along the axis all is counted the way the rays go.
-        s0, s1, u0, u1 = FAR, -FAR, FAR, -FAR
-        x0, x1, y0, y1, z0, z1 = FAR, -FAR, FAR, -FAR, FAR, -FAR
-        deepest = ZERO
-        for k in range(live):
-            s0, s1 = min(s0, slope[0, k]), max(s1, slope[0, k])
-            u0, u1 = min(u0, slope[1, k]), max(u1, slope[1, k])
-            x0, x1 = min(x0, start[0, k]), max(x1, start[0, k])
-            y0, y1 = min(y0, start[1, k]), max(y1, start[1, k])
-            z0, z1 = min(z0, start[2, k]), max(z1, start[2, k])
-            deepest = max(deepest, rest[2, k])
+        s0, s1 = least(room, SLOPE), most(room, SLOPE)
+        u0, u1 = least(room, SLOPE + PACKET), most(room, SLOPE + PACKET)
+        x0, x1 = least(room, START), most(room, START)
+        y0, y1 = least(room, START + PACKET), most(room, START + PACKET)
+        z0, z1 = least(room, START + 2 * PACKET), most(room, START + 2 * PACKET)
+        deepest, largest = most(room, DEPTH), larger(reach, most(room, LARGEST_OF))
         if away:
             s0, s1, u0, u1, z0, z1 = -s1, -s0, -u1, -u0, -z1, -z0
         low = -root[z + 3] if away else root[z]
         high = -root[z] if away else root[z + 3]
 
         # Leave rays alone that spread over too much of the scene.
-        reached = max(high - z0, ZERO)
+        reached = larger(high - z0, ZERO)
         wide = (x1 - x0) + (s1 - s0) * reached
         tall = (y1 - y0) + (u1 - u0) * reached
         across = (root[x + 3] - root[x]) + (root[y + 3] - root[y])
-        together = same & (2 * live > end - r) & (wide * tall <= density * across * across)
-        if not together and (live > 0 or not same):
-            for k in range(r, end):
-                single[alone] = k
-                alone += 1
-            r = end
-            continue
-        r = end
-        if live == 0:
+        if not ((2 * live > end - begin) & (wide * tall <= density * across * across)):
+            alone = send_alone(begin, end, single, alone)
             continue
 
         # Drop the packet if it misses the scene's box.
         margin = margin_unit * largest
         s0, s1, u0, u1 = s0 - WIDER, s1 + WIDER, u0 - WIDER, u1 + WIDER
         x0, x1, y0, y1, z0, z1 = x0 - margin, x1 + margin, y0 - margin, y1 + margin, z0 - margin, z1 + margin
-        entry = max(low - z1, ZERO)
+        entry = larger(low - z1, ZERO)
         leave = high - z0
         meets = (leave >= ZERO) & (x0 + s0 * (entry if s0 >= ZERO else leave) <= root[x + 3])
         meets &= x1 + s1 * (leave if s1 >= ZERO else entry) >= root[x]
@@ -163,7 +269,7 @@ def ready_packets(
         meets &= y1 + u1 * (leave if u1 >= ZERO else entry) >= root[y]
         if not meets:
             for k in range(live):
-                dropped[lane_of[k]] = 1
+                dropped[begin + lane_of[k]] = 1
             continue
 
         # Write the head: bounds, depth and margin, then axes and the order of visits.
@@ -177,15 +283,10 @@ def ready_packets(
         words[count, 14] = z | (4 if away else 0)
         words[count, 15] = octant
 
-        # Write the rays; lanes that have none repeat the first, with nothing to reach.
+        # Write the rays.
         for k in range(PACKET):
-            used = k < live
-            j = k if used else 0
-            at[count, k] = lane_of[j] if used else -1
-            for axis in range(3):
-                row[HEAD + axis * PACKET + k] = start[axis, j]
-                row[HEAD + (3 + axis) * PACKET + k] = slope[axis, j]
-            row[HEAD + 6 * PACKET + k] = rest[0, j] if used else -ONE
-            row[HEAD + 7 * PACKET + k] = rest[1, j]
+            at[count, k] = begin + lane_of[k] if k < live else -1
+        for k in range(8 * PACKET):
+            row[HEAD + k] = room[k]
         count += 1
     return count, alone, len(origins)

@@ -10,7 +10,7 @@ Cost: a third of that of one ray after the other.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import helper, inlined, kernel
+from striptools.kernels.compiled import helper, inlined
 from striptools.kernels.wide import BROAD, EMPTY
 
 ROW = 24
@@ -63,6 +63,26 @@ def picked(x, y, z, axis):
 
 
 @inlined
+def longest_of(x, y, z):
+    """The largest of three coordinates, in size."""
+    return larger(larger(abs(x), abs(y)), abs(z))
+
+
+@inlined
+def longest_axis(x, y, z):
+    """The dominant axis of a direction."""
+    return 0 if (abs(x) >= abs(y)) & (abs(x) >= abs(z)) else (1 if abs(y) >= abs(z) else 2)
+
+
+@inlined
+def is_ray(ox, oy, oz, dx, dy, dz, far):
+    """Whether a scaled origin, a direction and a reach make a ray."""
+    finite = (abs(ox) <= LARGEST) & (abs(oy) <= LARGEST) & (abs(oz) <= LARGEST)
+    finite &= (abs(dx) <= LARGEST) & (abs(dy) <= LARGEST) & (abs(dz) <= LARGEST)
+    return finite & (longest_of(dx, dy, dz) >= LEAST_NORMAL) & (far > ZERO)
+
+
+@inlined
 def steep(way):
     """A direction component, or a tiny one of the same sign for one too small to cross the scene."""
     tiny = -TINY if way < ZERO else TINY
@@ -107,13 +127,9 @@ def prepare_chunk(room, frame):
         dx = flushed(room[WAY + i])
         dy = flushed(room[WAY + CHUNK + i])
         dz = flushed(room[WAY + 2 * CHUNK + i])
-        largest = larger(larger(abs(ox), abs(oy)), abs(oz))
-        longest = larger(larger(abs(dx), abs(dy)), abs(dz))
         far = flushed(room[REACH + i])
-        finite = (abs(ox) <= LARGEST) & (abs(oy) <= LARGEST) & (abs(oz) <= LARGEST)
-        finite &= (abs(dx) <= LARGEST) & (abs(dy) <= LARGEST) & (abs(dz) <= LARGEST)
-        room[VALID + i] = ONE if finite & (longest >= LEAST_NORMAL) & (far > ZERO) else ZERO
-        shorten, length = scaled_by(longest)
+        room[VALID + i] = ONE if is_ray(ox, oy, oz, dx, dy, dz, far) else ZERO
+        shorten, length = scaled_by(longest_of(dx, dy, dz))
         dx = flushed(dx * shorten)
         dy = flushed(dy * shorten)
         dz = flushed(dz * shorten)
@@ -121,7 +137,7 @@ def prepare_chunk(room, frame):
         room[REACH + CHUNK + i] = flushed(shorten / scale)
 
         # Make the constants of the slab test.
-        margin = margin_unit * larger(largest, reach)
+        margin = margin_unit * larger(longest_of(ox, oy, oz), reach)
         octant = np.int32(7)
         octant ^= np.int32(dx < ZERO) | np.int32(dy < ZERO) << 1 | np.int32(dz < ZERO) << 2
         room[OCTANT + i] = as_word(octant)
@@ -137,7 +153,7 @@ def prepare_chunk(room, frame):
         room[SLAB + 8 * CHUNK + i] = flushed(iz * unit_z)
 
         # Make the shear.
-        z = 0 if (abs(dx) >= abs(dy)) & (abs(dx) >= abs(dz)) else (1 if abs(dy) >= abs(dz) else 2)
+        z = longest_axis(dx, dy, dz)
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
         depth = picked(dx, dy, dz, z)

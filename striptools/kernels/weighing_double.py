@@ -4,7 +4,7 @@ import numpy as np
 
 from striptools.kernels.compiled import kernel
 from striptools.kernels.packed_hits import decode_triangles
-from striptools.kernels.packets import longest_axis
+from striptools.kernels.rays import longest_axis
 from striptools.kernels.weighing import CHUNK
 from striptools.kernels.wide import flushed
 
