@@ -28,6 +28,7 @@ Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from striptools.trace.numerics import (
@@ -43,6 +44,9 @@ from striptools.trace.numerics import (
 
 Corners = tuple[Array, Array, Array]
 """One coordinate of the three corners a, b, c of a triangle, or (8,) each of a leaf's lanes."""
+
+FARTHER = np.float32(1 + 2**-20)
+"""More than a quotient, and two products in its place, are rounded by."""
 
 
 class Shear(NamedTuple):
@@ -146,6 +150,22 @@ def crossing_of(edges: Edges, turn: Array | None = None, arithmetic: Arithmetic 
     sign = sign_of(determinant)
     scaled_t = with_sign_of(jnp.where(inside & around, scaled_t, jnp.inf), sign)
     return arithmetic.settled(arithmetic.quotient(scaled_t, with_sign_of(determinant, sign)))
+
+
+def may_cross(edges: Edges, nearest: Array, turn: Array | None = None) -> Array:
+    """Whether `crossing_of` may be positive and at most `nearest`: where it is this is true.
+
+    Cheaper, as nothing divides and no corners are compared: rays miss all triangles of most leaves. What is
+    divided there is compared here, up to roundings.
+    """
+    a, b, c, heights, _, _ = edges
+    inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
+    determinant = _summed(a, b, c, turn)
+    scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
+    sign = sign_of(determinant)
+    scaled_t = with_sign_of(scaled_t, sign)
+    reach = with_sign_of(determinant, sign) * (nearest * FARTHER)
+    return inside & (scaled_t > 0) & (scaled_t <= reach)
 
 
 def windings_of(edges: Edges, shear: Shear) -> Array:

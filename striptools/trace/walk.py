@@ -47,7 +47,7 @@ from striptools.trace.numerics import (
     quotient,
     smaller,
 )
-from striptools.trace.triangle import Corners, Shear, pick, shear_of
+from striptools.trace.triangle import Corners, Shear, edges_of, may_cross, pick, shear_of
 from striptools.trace.triangle_tests import Triangles, crossings_by, wants_way
 from striptools.trace.walk_gather import Gathered, GatherKind, gather_leaf, nothing_gathered
 from striptools.types import TriangleTest
@@ -142,6 +142,11 @@ class Leaf(NamedTuple):
         again = again or (lambda: self)
         t = crossings_by(test, self.triangles, shear, arithmetic, lambda: again().triangles)
         return t if self.filled is None else jnp.where(self.filled, t, np.float32(0))
+
+    def may_cross(self, shear: Shear, nearest: Array) -> Array:
+        """(8,) bool: where `crossings` by the watertight test may be nearer; see `triangle.may_cross`."""
+        may = may_cross(edges_of(self.x, self.y, self.z, shear), nearest, self.turn)
+        return may if self.filled is None else may & self.filled
 
     @property
     def triangles(self) -> Triangles:

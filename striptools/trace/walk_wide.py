@@ -7,8 +7,8 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.leaf_blocks import leaf_in, test_block, triangles_in
-from striptools.trace.numerics import index
+from striptools.trace.leaf_blocks import leaf_in, triangles_in
+from striptools.trace.numerics import any_lane, index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     Best,
@@ -18,6 +18,7 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     found_any,
+    nearer,
     walk_rays,
 )
 from striptools.trace.walk_packets import walk_packets
@@ -77,13 +78,20 @@ class WideScene(NamedTuple):
 
     def visit_leaf(self, shear: Shear, where: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, against the closest hit so far."""
-        if not options.any_hit:
-            return test_block(self.blocks, where, shear, best, options.test)
 
         def at_hand() -> Leaf:
             return leaf_in(self.blocks, where, shear.axes)
 
-        return found_any(best, at_hand().crossings(shear, test=options.test, again=at_hand))
+        def tested() -> Best:
+            leaf = at_hand()
+            t = leaf.crossings(shear, test=options.test, again=at_hand)
+            return found_any(best, t) if options.any_hit else nearer(best, t, leaf.name)
+
+        if options.batch or options.test != "watertight":
+            return tested()
+        # Read again where it matters: what is kept for a cond goes through memory.
+        may = at_hand().may_cross(shear, best.nearest)
+        return lax.cond(any_lane(may), tested, lambda: best)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
