@@ -330,7 +330,7 @@ class ReadyRay(NamedTuple):
     @property
     def start(self) -> "Place":
         """Where the walk starts."""
-        return Place(self.ints[START] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1), jnp.uint32(0))
+        return Place(self.ints[START] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
 
     @property
     def visited(self) -> Array:
@@ -365,16 +365,12 @@ def lane_bits_of(octant: Array, width: int) -> Array:
 
 
 class Place(NamedTuple):
-    """Where a ray is: the child to visit next, the lanes left of the node it came from, and the child's.
-
-    The lane is the place in the order of visits.
-    """
+    """Where a ray is: the child to visit next, and the node it came from with the lanes that it has left."""
 
     child: Array
     node: Array
     lanes: Array
     height: Array
-    lane: Array
 
 
 def trace_rays(
@@ -504,16 +500,16 @@ def scaled_ray(frame: Frame, origin: Array, direction: Array) -> tuple[Array, Ar
 
 def next_child(
     scene: WalkScene, ray: Mirrored, node: Array, lanes: Array, height: Array, stack: Array
-) -> Place:
-    """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
+) -> tuple[Place, Array]:
+    """Take the nearest lane left, of the node at hand or the one on top of the stack: its child, and it."""
     empty = lanes == 0
     height = jnp.where(empty, height - 1, height)
     top = lax.dynamic_slice(stack, (index(height), jnp.uint32(0)), (1, 2))[0]
     node = jnp.where(empty, top[0], node)
     lanes = jnp.where(empty, top[1], lanes)
     order = 31 - lax.clz(lanes)
-    child = scene.child_of(node, index(order ^ ray.mirror))
-    return Place(child, node, lanes ^ (jnp.int32(1) << order), height, index(order))
+    lane = index(order ^ ray.mirror)
+    return Place(scene.child_of(node, lane), node, lanes ^ (jnp.int32(1) << order), height), lane
 
 
 def _visit_node(
@@ -525,7 +521,7 @@ def _visit_node(
     height = jnp.where(place.lanes != 0, place.height + 1, place.height)
     met = scene.lanes_met(place.child, ray.slab, limit)
     lanes = jnp.sum(jnp.where(met, ray.lane_bits, 0))
-    there = next_child(scene, ray, place.child, lanes, height, stack)
+    there, _ = next_child(scene, ray, place.child, lanes, height, stack)
     # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
     active = place.child >= 0
     return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
@@ -660,7 +656,7 @@ class _Walk:
             best = gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
         else:
             best = self.scene.visit_leaf(ray.shear, where, best, self.options)
-        there = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
+        there, _ = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
             there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
         return there, best
@@ -741,7 +737,7 @@ def walk_alone(
 def found_alone(scene: Any, end: Alone, any_hit: bool) -> tuple[Array, Array]:
     """What is reported of the walk of one ray: t in the caller's units, and the name of the triangle."""
     child = jnp.where(end.ended, DONE, 0)
-    place = Place(child, child, child, child, child)
+    place = Place(child, child, child, child)
     return _result(scene, end.ray, place, end.best, any_hit)[:2]
 
 

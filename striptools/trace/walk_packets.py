@@ -317,15 +317,17 @@ def _limit(packet: _Packet, t: Array) -> Array:
     return folded(t, larger) * packet.deepest * SLACK + packet.margin
 
 
-def _box_of(scene: PacketScene, packet: _Packet, place: Place) -> _Box:
+def _box_of(scene: PacketScene, packet: _Packet, state: "_State") -> _Box:
     """The box of the leaf at hand, as its node has it."""
-    lane = place.lane ^ index(mirror_of(packet.octant, scene.width))
-    x0, x1, y0, y1, z0, z1 = scene.sides_in(place.node, packet.rows, lane)
+    x0, x1, y0, y1, z0, z1 = scene.sides_in(state.place.node, packet.rows, state.lane)
     return _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
 
 
 class _State(NamedTuple):
+    """Where a packet is; the lane is where the node that it came from has the child at hand."""
+
     place: Place
+    lane: Array
     stack: Array
     turns: Array
 
@@ -353,22 +355,22 @@ def _walk_packet(
         met = _meets(packet, box, limit)
         lanes = jnp.sum(jnp.where(met, lane_bits, 0))
         there = next_child(scene, turn, place.child, lanes, height, stack)
-        return _State(there, stack, state.turns + 1)
+        return _State(*there, stack, state.turns + 1)
 
-    def leave_leaf(state: _State, found: _Found) -> tuple[Place, _Found]:
+    def leave_leaf(state: _State, found: _Found) -> tuple[Place, Array, _Found]:
         place = state.place
         # Before rays are tested, which goes on while its loads are waited for.
         where = scene.find_leaf(place.child)
         # Between the rays of a packet there may be room for a leaf: then it is not even read.
-        rays = _bits(_rays_in(packet, _box_of(scene, packet, place), found.t))
+        rays = _bits(_rays_in(packet, _box_of(scene, packet, state), found.t))
         found = lax.cond(
             rays != 0,
             lambda: _test_leaf(scene, packet, where, rays, found, options),
             lambda: found,
         )
-        there = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
+        there, lane = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
         done = found.limit < 0
-        return there._replace(child=jnp.where(done, DONE, there.child)), found
+        return there._replace(child=jnp.where(done, DONE, there.child)), lane, found
 
     def nodes_then_leaf(carried: tuple[_State, _Found]) -> tuple[_State, _Found]:
         state, found = carried
@@ -377,17 +379,17 @@ def _walk_packet(
             lambda s: visit_node(s, found.limit),
             state,
         )
-        place, found = lax.cond(
+        place, lane, found = lax.cond(
             (state.place.child < 0) & (state.place.child != DONE),
             lambda: leave_leaf(state, found),
-            lambda: (state.place, found),
+            lambda: (state.place, state.lane, found),
         )
-        return state._replace(place=place), found
+        return state._replace(place=place, lane=lane), found
 
     zero = jnp.int32(0)
     found = _Found(packet.rays[6], jnp.full(PACKET, MISS), _limit(packet, packet.rays[6]))
     first = jnp.where(folded(packet.rays[6], larger) > 0, zero, DONE)
-    state = _State(Place(first, zero, zero, jnp.int32(1), jnp.uint32(0)), stack, zero)
+    state = _State(Place(first, zero, zero, jnp.int32(1)), jnp.uint32(0), stack, zero)
     state, found = lax.while_loop(
         lambda carried: (carried[0].place.child != DONE) & (carried[0].turns <= scene.node_count),
         nodes_then_leaf,
