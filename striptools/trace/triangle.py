@@ -46,7 +46,10 @@ Corners = tuple[Array, Array, Array]
 """One coordinate of the three corners a, b, c of a triangle, or (8,) each of a leaf's lanes."""
 
 FARTHER = np.float32(1 + 2**-20)
-"""More than a quotient, and two products in its place, are rounded by."""
+"""More than a quotient, and two products in its place, are rounded by: six times 2**-24."""
+
+DOUBT = np.float32(2**-20)
+"""More than a sum of three changes with their order, by the sum of their sizes: four times 2**-24."""
 
 
 class Shear(NamedTuple):
@@ -152,20 +155,30 @@ def crossing_of(edges: Edges, turn: Array | None = None, arithmetic: Arithmetic 
     return arithmetic.settled(arithmetic.quotient(scaled_t, with_sign_of(determinant, sign)))
 
 
-def may_cross(edges: Edges, nearest: Array, turn: Array | None = None) -> Array:
-    """Whether `crossing_of` may be positive and at most `nearest`: where it is this is true.
+def may_cross(edges: Edges, nearest: Array, *, in_order: bool) -> Array:
+    """Whether `crossing_of` may be positive and at most `nearest`: where it is, this is true.
 
     Cheaper, as nothing divides and no corners are compared: rays miss all triangles of most leaves. What is
     divided there is compared here, up to roundings.
+
+    Args:
+        edges: Of the triangles.
+        nearest: Of the closest hit so far.
+        in_order: Whether corner a is the first in the canonical order, so that sums are those of
+            `crossing_of`. Else three numbers of any sign may add up to another sign than there.
     """
     a, b, c, heights, _, _ = edges
     inside = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
-    determinant = _summed(a, b, c, turn)
-    scaled_t = _summed(rounded(a * heights[0]), rounded(b * heights[1]), rounded(c * heights[2]), turn)
+    determinant = a + b + c
+    first, second, third = (rounded(edge * at) for edge, at in zip((a, b, c), heights, strict=True))
+    scaled_t = first + second + third
     sign = sign_of(determinant)
     scaled_t = with_sign_of(scaled_t, sign)
     reach = with_sign_of(determinant, sign) * (nearest * FARTHER)
-    return inside & (scaled_t > 0) & (scaled_t <= reach)
+    if in_order:
+        return inside & (scaled_t > 0) & (scaled_t <= reach)
+    doubt = (jnp.abs(first) + jnp.abs(second) + jnp.abs(third)) * DOUBT
+    return inside & (scaled_t >= -doubt) & (scaled_t - doubt <= reach)
 
 
 def windings_of(edges: Edges, shear: Shear) -> Array:

@@ -145,7 +145,7 @@ class Leaf(NamedTuple):
 
     def may_cross(self, shear: Shear, nearest: Array) -> Array:
         """(8,) bool: where `crossings` by the watertight test may be nearer; see `triangle.may_cross`."""
-        may = may_cross(edges_of(self.x, self.y, self.z, shear), nearest, self.turn)
+        may = may_cross(edges_of(self.x, self.y, self.z, shear), nearest, in_order=self.turn is None)
         return may if self.filled is None else may & self.filled
 
     @property
@@ -567,6 +567,18 @@ def _first_by_face(
 
     several = folded(jnp.where(names == NO_NAME, jnp.int32(0), jnp.int32(1)), jnp.add) > 1
     return lax.cond(several | (nearest == best.nearest), by_face, lambda: (least, jnp.bool_(True)))
+
+
+def sifted(
+    at_hand: Callable[[], Leaf], shear: Shear, best: Best, tested: Callable[[], Best], test: TriangleTest
+) -> Best:
+    """What is `tested` of a leaf, or `best` where none of its triangles can be nearer.
+
+    The default test alone is worth it. `tested` makes the leaf again: what a cond keeps goes through memory.
+    """
+    if test != "watertight":
+        return tested()
+    return lax.cond(any_lane(at_hand().may_cross(shear, best.nearest)), tested, lambda: best)
 
 
 def found_any(best: Best, t: Array) -> Best:

@@ -49,6 +49,7 @@ from striptools.trace.walk import (
     WalkOptions,
     found_any,
     nearer,
+    sifted,
     walk_rays,
 )
 from striptools.trace.walk_packets import walk_packets
@@ -236,11 +237,16 @@ class PackedScene(NamedTuple):
         def decoded() -> Leaf:
             return self.leaf_of(shear.axes, where, options.decode)
 
-        leaf = decoded()
-        t = leaf.crossings(shear, test=options.test, again=decoded)
-        if options.any_hit:
-            return found_any(best, t)
-        return nearer(best, t, leaf.name, self.faces_of if self.has_faces else None)
+        def tested() -> Best:
+            leaf = decoded()
+            t = leaf.crossings(shear, test=options.test, again=decoded)
+            if options.any_hit:
+                return found_any(best, t)
+            return nearer(best, t, leaf.name, self.faces_of if self.has_faces else None)
+
+        if options.batch or options.any_hit:
+            return tested()
+        return sifted(decoded, shear, best, tested, options.test)
 
     def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""

@@ -46,6 +46,7 @@ from striptools.trace.walk import (
     mirror_of,
     nearer,
     next_child,
+    sifted,
 )
 
 FAR = np.float32(3.0e38)
@@ -279,8 +280,13 @@ def _one_ray(
 ) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
     before = Best(*(lax.dynamic_slice(a, (lane,), (1,))[0] for a in (t, name)))
-    crossing = leaf.crossings(packet.shear_of(lane))
-    best = nearer(before, crossing, leaf.name, scene.faces_of if scene.has_faces else None)
+    shear = packet.shear_of(lane)
+
+    def tested() -> Best:
+        faces_of = scene.faces_of if scene.has_faces else None
+        return nearer(before, leaf.crossings(shear), leaf.name, faces_of)
+
+    best = sifted(lambda: leaf, shear, before, tested, "watertight")
     return (
         lax.dynamic_update_slice(t, best.nearest[None], (lane,)),
         lax.dynamic_update_slice(name, best.name[None], (lane,)),

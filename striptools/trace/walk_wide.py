@@ -8,7 +8,7 @@ from jax import Array, lax
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
 from striptools.trace.leaf_blocks import leaf_in, triangles_in
-from striptools.trace.numerics import any_lane, index
+from striptools.trace.numerics import index
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     Best,
@@ -19,6 +19,7 @@ from striptools.trace.walk import (
     WalkOptions,
     found_any,
     nearer,
+    sifted,
     walk_rays,
 )
 from striptools.trace.walk_packets import walk_packets
@@ -87,11 +88,7 @@ class WideScene(NamedTuple):
             t = leaf.crossings(shear, test=options.test, again=at_hand)
             return found_any(best, t) if options.any_hit else nearer(best, t, leaf.name)
 
-        if options.batch or options.test != "watertight":
-            return tested()
-        # Read again where it matters: what is kept for a cond goes through memory.
-        may = at_hand().may_cross(shear, best.nearest)
-        return lax.cond(any_lane(may), tested, lambda: best)
+        return tested() if options.batch else sifted(at_hand, shear, best, tested, options.test)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
