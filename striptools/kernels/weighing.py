@@ -95,6 +95,28 @@ def weigh_held(room, held, scale, ray_of, turn_of, u, v):
         give_weights(room, i, turn_of[i], ray_of[i], u, v)
 
 
+@inlined
+def take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of):
+    """Gather rays and corners of hits, step by step, so that one waits for memory while others do."""
+    for i in range(held):
+        slot_of[i] = place[face[ray_of[i]]]
+    # Touch each line of the leaves first: with little else to do, more loads are under way at once.
+    touched = np.float32(0.0)
+    for i in range(held):
+        block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
+        for row in range(0, 10, 2):
+            touched += blocks[block, row, lane]
+    room[0] = touched
+    for i in range(held):
+        kx, ky, kz = take_ray(origins, directions, ray_of[i], room, i)
+        block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
+        for j in range(3):
+            room[CORNERS + j * CHUNK + i] = blocks[block, 3 * kx + j, lane]
+            room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
+            room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
+        turn_of[i] = slot_of[i] & 3
+
+
 @kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
@@ -125,28 +147,23 @@ def weigh_hits(
     held = 0
     for k in range(len(at)):
         r = at[k]
-        if r >= 0:
-            t[r] = found_t[k]
-            name = found_face[k]
-            face[r] = name
-            triangle[r] = triangle_of[name] if name >= 0 and len(triangle_of) > 0 else max(name, -1)
-            if weighed and name < 0:
-                u[r] = 0.0
-                v[r] = 0.0
-            elif weighed:
-                ray_of[held] = r
-                held += 1
-        if held == CHUNK or (held > 0 and k == len(at) - 1):
-            # Step by step, so that one waits for memory while others do.
-            for i in range(held):
-                slot_of[i] = place[face[ray_of[i]]]
-            for i in range(held):
-                kx, ky, kz = take_ray(origins, directions, ray_of[i], room, i)
-                block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
-                for j in range(3):
-                    room[CORNERS + j * CHUNK + i] = blocks[block, 3 * kx + j, lane]
-                    room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
-                    room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
-                turn_of[i] = slot_of[i] & 3
-            weigh_held(room, held, scale, ray_of, turn_of, u, v)
-            held = 0
+        if r < 0:
+            continue
+        # Without branches, which would go astray: whether a ray hits anything is hard to foresee.
+        name = found_face[k]
+        t[r] = found_t[k]
+        face[r] = name
+        own = triangle_of[max(name, 0)] if len(triangle_of) > 0 else name
+        triangle[r] = own if name >= 0 else np.int32(-1)
+        if weighed:
+            u[r] = 0.0
+            v[r] = 0.0
+            ray_of[held] = r
+            held += np.int64(name >= 0)
+            if held == CHUNK:
+                take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of)
+                weigh_held(room, held, scale, ray_of, turn_of, u, v)
+                held = 0
+    if held > 0:
+        take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of)
+        weigh_held(room, held, scale, ray_of, turn_of, u, v)
