@@ -201,7 +201,7 @@ class PackedScene(NamedTuple):
 
     def leaf_for_packets(
         self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None
-    ) -> Leaf:
+    ) -> Callable[[], Leaf]:
         """The same, decoded once: behind a cond, or XLA decodes it anew for every use.
 
         What an axis needs is chosen, not what it gives: a few numbers in the place of lanes.
@@ -218,7 +218,8 @@ class PackedScene(NamedTuple):
 
         # Always so, which XLA does not know.
         x, y, z = lax.cond(where.block <= BLOCK_BITS, decoded, lambda: nothing)
-        return Leaf(tuple(x), tuple(y), tuple(z), _first_corner_along(x, y, z, axes), *self._named(where))
+        turn = _first_corner_along(x, y, z, axes)
+        return lambda: Leaf(tuple(x), tuple(y), tuple(z), turn, *self._named(where))
 
     def _named(self, where: "_Run") -> tuple[Array, Array]:
         """Which lanes hold a triangle of a run, and their names."""

@@ -21,6 +21,7 @@ Differences:
 Cost: about 200 operations a leaf, 45 a triangle and eight rays, or 100 a ray and eight triangles.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -71,8 +72,10 @@ class PacketScene(WalkScene, Protocol):
         """Sides of the box in one lane, () float32 each, as of `sides_of`."""
         ...
 
-    def leaf_for_packets(self, axes: tuple[Array, Array, Array], where: Any, decode: Decode | None) -> Leaf:
-        """`leaf_of` for one leaf and many rays."""
+    def leaf_for_packets(
+        self, axes: tuple[Array, Array, Array], where: Any, decode: Decode | None
+    ) -> Callable[[], Leaf]:
+        """What makes `leaf_of` for one leaf and many rays, again and again for nothing."""
         ...
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
@@ -251,19 +254,19 @@ def _test_leaf(
     scene: PacketScene, packet: _Packet, where: Any, rays: Array, found: _Found, options: WalkOptions
 ) -> _Found:
     """Test a leaf, that the `rays` (bits) may meet, by these rays or by its triangles."""
-    leaf = scene.leaf_for_packets(packet.axes, where, options.decode)
-    triangles = _triangles_in(packet, leaf, found.limit)
+    at_hand = scene.leaf_for_packets(packet.axes, where, options.decode)
+    triangles = _triangles_in(packet, at_hand(), found.limit)
     ray_count, count = (lax.population_count(bits).astype(jnp.float32) for bits in (rays, triangles))
     by_ray = ray_count * RAY_OVER_TRIANGLE < count
     none = jnp.uint32(0)
 
     def test_ray(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
-        return left, *_one_ray(scene, packet, leaf, lane, state[1], state[2])
+        return left, *_one_ray(scene, packet, at_hand, lane, state[1], state[2])
 
     def test_triangle(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
-        return left, *_one_triangle(scene, packet, leaf, lane, state[1], state[2])
+        return left, *_one_triangle(scene, packet, at_hand(), lane, state[1], state[2])
 
     state = (jnp.where(by_ray, rays, none), found.t, found.name)
     state = lax.while_loop(lambda s: s[0] != 0, test_ray, state)
@@ -276,17 +279,22 @@ def _test_leaf(
 
 
 def _one_ray(
-    scene: PacketScene, packet: _Packet, leaf: Leaf, lane: Array, t: Array, name: Array
+    scene: PacketScene,
+    packet: _Packet,
+    at_hand: Callable[[], Leaf],
+    lane: Array,
+    t: Array,
+    name: Array,
 ) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
     before = Best(*(lax.dynamic_slice(a, (lane,), (1,))[0] for a in (t, name)))
     shear = packet.shear_of(lane)
 
     def tested() -> Best:
-        faces_of = scene.faces_of if scene.has_faces else None
+        faces_of, leaf = scene.faces_of if scene.has_faces else None, at_hand()
         return nearer(before, leaf.crossings(shear), leaf.name, faces_of)
 
-    best = sifted(lambda: leaf, shear, before, tested, "watertight")
+    best = sifted(at_hand, shear, before, tested, "watertight")
     return (
         lax.dynamic_update_slice(t, best.nearest[None], (lane,)),
         lax.dynamic_update_slice(name, best.name[None], (lane,)),

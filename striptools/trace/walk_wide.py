@@ -1,5 +1,6 @@
 """A scene of float32 boxes and corners, as the walk sees it: expanded, the fastest and the largest."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -94,9 +95,11 @@ class WideScene(NamedTuple):
         """The triangles of a leaf, their corners along these axes."""
         return leaf_in(self.blocks, where, axes)
 
-    def leaf_for_packets(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
-        """The same: nothing is decoded."""
-        return self.leaf_of(axes, where, decode)
+    def leaf_for_packets(
+        self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None
+    ) -> Callable[[], Leaf]:
+        """The same, read wherever it is used: nothing is decoded, and a copy costs as much as a test."""
+        return lambda: self.leaf_of(axes, where, decode)
 
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
         """Sides of a node's boxes."""
