@@ -52,7 +52,7 @@ from striptools.trace.walk import (
 
 FAR = np.float32(3.0e38)
 
-RAY_OVER_TRIANGLE = np.float32(0.5)
+RAY_OVER_TRIANGLE = np.float32(0.7)
 """What a ray against all triangles of a leaf costs, over a triangle against all rays."""
 
 
