@@ -40,7 +40,7 @@ from striptools.trace import Tracer, walk_single
 from striptools.trace.box import lanes_met
 from striptools.trace.launch import program
 from striptools.trace.slbvh import lay_out_slbvh
-from striptools.trace.walk import MISS, SLACK, WalkOptions, nothing_yet, prepared_rays, ready_ray
+from striptools.trace.walk import MISS, SLACK, ReadyRay, WalkOptions, nothing_yet, prepared_rays
 from striptools.trace.walk_slbvh import Place, SlbvhScene, _State, _visit, step_in, step_out
 
 BALANCES = ("sah", "morton")
@@ -424,7 +424,7 @@ def test_visits_are_those_of_a_recursion_near_child_first(name, balance):
     t_max = np.full(len(origins), np.inf, np.float32)
     first = np.asarray(arrays.leaves.first)
     for k, row in enumerate(prepared_rays(arrays, origins, directions, t_max)):
-        ray = ready_ray(row)
+        ray = ReadyRay(row)
         twin = Twin(arrays, ray)
         assert trail_of(arrays, ray) == twin.visited
         blocks = sum(int(first[leaf + 1] - first[leaf]) for leaf in twin.leaves)
@@ -449,7 +449,7 @@ def test_a_walk_that_goes_to_the_far_child_first_would_be_seen():
     arrays = jax.tree.map(jnp.asarray, lay_out_slbvh(scene, scene.hierarchy).arrays)
     rays = rays_at(scene, 4, 8)
     rows = prepared_rays(arrays, *rays, np.full(4, np.inf, np.float32))
-    assert any(trail_of(arrays, ready_ray(row)) != Twin(arrays, ready_ray(row), True).visited for row in rows)
+    assert any(trail_of(arrays, ReadyRay(row)) != Twin(arrays, ReadyRay(row), True).visited for row in rows)
 
 
 def test_a_ray_that_misses_the_root_visits_the_root():

@@ -284,18 +284,27 @@ class Traced(NamedTuple):
 
 
 class ReadyRay(NamedTuple):
-    """What stays the same all along a walk, in as few arrays as can be: a loop pays for each.
+    """What stays the same all along a walk, in one array: a loop pays for each.
 
     Attributes:
-        floats: (17,) float32: what the properties name; (20,) where the direction follows.
-        ints: (7,) int32: axes of the shear, octant, and where the walk starts: exclusive-or of `DONE` and
-            the child to visit first (zeros are a ray that is done), the root's lanes left, nodes visited.
-        lane_bits: (width,) int32, the bit that stands for each lane, the nearest highest.
+        words: (24,) float32: 17 numbers that the properties name, then the bits of seven integers; (27,)
+            where the direction follows.
     """
 
-    floats: Array
-    ints: Array
-    lane_bits: Array
+    words: Array
+
+    @property
+    def floats(self) -> Array:
+        """(17,) float32."""
+        return self.words[:FLOATS]
+
+    def integer(self, place: int) -> Array:
+        """Of (7,) int32: axes of the shear, octant, and where the walk starts.
+
+        That is exclusive-or of `DONE` and the child to visit first (zeros are a ray that is done), the root's
+        lanes left, nodes visited.
+        """
+        return lax.bitcast_convert_type(self.words[FLOATS + place], jnp.int32)
 
     @property
     def slab(self) -> Slab:
@@ -305,11 +314,11 @@ class ReadyRay(NamedTuple):
     @property
     def shear(self) -> Shear:
         """The ray as the triangle test sees it."""
-        x, y, z = (index(self.ints[k]) for k in range(3))
+        x, y, z = (index(self.integer(k)) for k in range(3))
         origin = (self.floats[9], self.floats[10], self.floats[11])
         way = None
-        if len(self.floats) > FLOATS:
-            way = (self.floats[FLOATS], self.floats[FLOATS + 1], self.floats[FLOATS + 2])
+        if len(self.words) > WORDS:
+            way = (self.words[WORDS], self.words[WORDS + 1], self.words[WORDS + 2])
         return Shear((x, y, z), origin, self.floats[12], self.floats[13], self.floats[14], way)
 
     @property
@@ -323,28 +332,19 @@ class ReadyRay(NamedTuple):
         return self.floats[16]
 
     @property
-    def mirror(self) -> Array:
+    def octant(self) -> Array:
         """See `mirror_of`."""
-        return mirror_of(self.ints[3], len(self.lane_bits))
+        return self.integer(3)
 
     @property
     def start(self) -> "Place":
         """Where the walk starts."""
-        return Place(self.ints[START] ^ DONE, jnp.int32(0), self.ints[5], jnp.int32(1))
+        return Place(self.integer(START) ^ DONE, jnp.int32(0), self.integer(5), jnp.int32(1))
 
     @property
     def visited(self) -> Array:
         """Nodes visited before the walk starts."""
-        return self.ints[6]
-
-
-class Mirrored(Protocol):
-    """A ray, or rays that go the same way."""
-
-    @property
-    def mirror(self) -> Array:
-        """See `mirror_of`."""
-        ...
+        return self.integer(6)
 
 
 def mirror_of(octant: Any, width: int) -> Any:
@@ -447,15 +447,6 @@ def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root
     return jnp.concatenate([floats, lax.bitcast_convert_type(ints, jnp.float32)])
 
 
-def ready_ray(row: Array, width: int = WIDTH) -> ReadyRay:
-    """The ray that a row says, for nodes of so many children."""
-    ints = lax.bitcast_convert_type(row[FLOATS:WORDS], jnp.int32)
-    floats = row[:FLOATS]
-    if len(row) > WORDS:
-        floats = jnp.concatenate([floats, row[WORDS:]])
-    return ReadyRay(floats, ints, lane_bits_of(ints[3], width))
-
-
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
     """Floats and ints of a `ReadyRay`.
 
@@ -499,17 +490,26 @@ def scaled_ray(frame: Frame, origin: Array, direction: Array) -> tuple[Array, Ar
 
 
 def next_child(
-    scene: WalkScene, ray: Mirrored, node: Array, lanes: Array, height: Array, stack: Array
+    scene: WalkScene, octant: Array, node: Array, lanes: Array, height: Array, stack: Array
 ) -> tuple[Place, Array]:
     """Take the nearest lane left, of the node at hand or the one on top of the stack: its child, and it."""
-    empty = lanes == 0
-    height = jnp.where(empty, height - 1, height)
-    top = lax.dynamic_slice(stack, (index(height), jnp.uint32(0)), (1, 2))[0]
-    node = jnp.where(empty, top[0], node)
-    lanes = jnp.where(empty, top[1], lanes)
+
+    def top() -> tuple[Array, Array, Array]:
+        entry = lax.dynamic_slice(stack, (index(height - 1), jnp.uint32(0)), (1, 2))[0]
+        return entry[0], entry[1], height - 1
+
+    # A branch, so that the processor guesses and goes on.
+    node, lanes, height = lax.cond(lanes == 0, top, lambda: (node, lanes, height))
     order = 31 - lax.clz(lanes)
-    lane = index(order ^ ray.mirror)
-    return Place(scene.child_of(node, lane), node, lanes ^ (jnp.int32(1) << order), height), lane
+    lane = index(order ^ mirror_of(octant, scene.width))
+    # The lane at the bottom of a stack stays: a ray that is done is done again.
+    left = lanes ^ ((jnp.int32(1) << order) & ((1 << scene.width) - 1))
+    return Place(scene.child_of(node, lane), node, left, height), lane
+
+
+def _at_bottom(scene: WalkScene) -> Place:
+    """Where a ray is that has nothing left to visit."""
+    return Place(jnp.int32(DONE), jnp.int32(scene.node_count - 1), jnp.int32(1 << scene.width), jnp.int32(0))
 
 
 def _visit_node(
@@ -520,11 +520,9 @@ def _visit_node(
     stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
     height = jnp.where(place.lanes != 0, place.height + 1, place.height)
     met = scene.lanes_met(place.child, ray.slab, limit)
-    lanes = jnp.sum(jnp.where(met, ray.lane_bits, 0))
-    there, _ = next_child(scene, ray, place.child, lanes, height, stack)
-    # A ray that waits at a leaf, or is done, goes through the motions and stays where it is.
-    active = place.child >= 0
-    return Place(*(jnp.where(active, new, old) for new, old in zip(there, place, strict=True))), stack
+    lanes = jnp.sum(jnp.where(met, lane_bits_of(ray.octant, scene.width), 0))
+    # A ray that is done goes through the motions, and none is at a leaf.
+    return next_child(scene, ray.octant, place.child, lanes, height, stack)[0], stack
 
 
 def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array] | None = None) -> Best:
@@ -668,9 +666,11 @@ class _Walk:
             best = gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
         else:
             best = self.scene.visit_leaf(ray.shear, where, best, self.options)
-        there, _ = next_child(self.scene, ray, place.node, place.lanes, place.height, state.stacks[k])
+        there, _ = next_child(self.scene, ray.octant, place.node, place.lanes, place.height, state.stacks[k])
         if self.options.any_hit:
-            there = there._replace(child=jnp.where(best.nearest < ray.t_max, DONE, there.child))
+            found = best.nearest < ray.t_max
+            bottom = _at_bottom(self.scene)
+            there = Place(*(jnp.where(found, a, b) for a, b in zip(bottom, there, strict=True)))
         return there, best
 
     def stay(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
@@ -690,7 +690,7 @@ def _walk_group(
     scene: WalkScene, group: Array, stacks: tuple[Array, ...], options: WalkOptions
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
-    rays = tuple(ready_ray(row, scene.width) for row in group)
+    rays = tuple(ReadyRay(row) for row in group)
     state, bests = _walked(
         _Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays)
     )
@@ -739,7 +739,7 @@ def walk_alone(
         options: What to compile in.
         nothing: What the ray has found before; None for no triangle.
     """
-    ray = ready_ray(row, scene.width)
+    ray = ReadyRay(row)
     best = _nothing_found(ray, options) if nothing is None else nothing(ray)
     state, bests = _walked(_Walk(scene, (ray,), options), (_floor(scene, options),), (best,))
     visits = state.visits[0] if state.visits else jnp.zeros(3, jnp.int32)

@@ -44,7 +44,6 @@ from striptools.trace.walk import (
     WalkOptions,
     WalkScene,
     lane_bits_of,
-    mirror_of,
     nearer,
     next_child,
     sifted,
@@ -346,17 +345,10 @@ class _State(NamedTuple):
     turns: Array
 
 
-class _Turn(NamedTuple):
-    """What `next_child` needs of a ray."""
-
-    mirror: Array
-
-
 def _walk_packet(
     scene: PacketScene, packet: _Packet, stack: Array, options: WalkOptions
 ) -> tuple[Array, tuple[Array, Array]]:
     """Walk one packet; its stack serves the next."""
-    turn = _Turn(mirror_of(packet.octant, scene.width))
     lane_bits = lane_bits_of(packet.octant, scene.width)
 
     def visit_node(state: _State, limit: Array) -> _State:
@@ -368,7 +360,7 @@ def _walk_packet(
         box = _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
         met = _meets(packet, box, limit)
         lanes = jnp.sum(jnp.where(met, lane_bits, 0))
-        there = next_child(scene, turn, place.child, lanes, height, stack)
+        there = next_child(scene, packet.octant, place.child, lanes, height, stack)
         return _State(*there, stack, state.turns + 1)
 
     def leave_leaf(state: _State, found: _Found) -> tuple[Place, Array, _Found]:
@@ -382,7 +374,7 @@ def _walk_packet(
             lambda: _test_leaf(scene, packet, where, rays, found, options),
             lambda: found,
         )
-        there, lane = next_child(scene, turn, place.node, place.lanes, place.height, state.stack)
+        there, lane = next_child(scene, packet.octant, place.node, place.lanes, place.height, state.stack)
         done = found.limit < 0
         return there._replace(child=jnp.where(done, DONE, there.child)), lane, found
 

@@ -22,7 +22,6 @@ from striptools.trace.walk import (
     ReadyRay,
     Traced,
     WalkOptions,
-    ready_ray,
 )
 
 
@@ -71,7 +70,7 @@ def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack:
     """
 
     def one(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        ray = ready_ray(row)
+        ray = ReadyRay(row)
         stack, ended = walk(scene, ray, stack, options)
         name = ended.best.name
         t = jnp.where(name < 0, jnp.float32(jnp.inf), in_range(ended.best.nearest * ray.t_unit))

@@ -140,7 +140,7 @@ def _visit(scene: SlbvhScene, ray: ReadyRay, state: _State, limit: Array) -> _St
 
     def near() -> Place:
         # The left child where the ray runs along the axis, the right one where against.
-        along = ray.mirror.astype(jnp.uint32) >> (prim_count & AXIS)
+        along = ray.octant.astype(jnp.uint32) >> (prim_count & AXIS)
         return step_in(place, ~along & 1)
 
     there = lax.cond(met & ~leaf, near, lambda: step_out(place))
