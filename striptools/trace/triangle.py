@@ -51,6 +51,9 @@ FARTHER = np.float32(1 + 2**-20)
 DOUBT = np.float32(2**-20)
 """More than a sum of three changes with their order, by the sum of their sizes: four times 2**-24."""
 
+FLUSHED = np.float32(2.0**-122)
+"""More than it changes where a part of it is so small that it becomes zero."""
+
 
 class Shear(NamedTuple):
     """A ray as the test sees it: axes (z dominant), origin along them, and the shear that sets it upright.
@@ -177,7 +180,7 @@ def may_cross(edges: Edges, nearest: Array, *, in_order: bool) -> Array:
     reach = with_sign_of(determinant, sign) * (nearest * FARTHER)
     if in_order:
         return inside & (scaled_t > 0) & (scaled_t <= reach)
-    doubt = (jnp.abs(first) + jnp.abs(second) + jnp.abs(third)) * DOUBT
+    doubt = (jnp.abs(first) + jnp.abs(second) + jnp.abs(third)) * DOUBT + FLUSHED
     return inside & (scaled_t >= -doubt) & (scaled_t - doubt <= reach)
 
 
