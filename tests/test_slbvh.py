@@ -395,7 +395,7 @@ class Twin:
             self.leaves.append(int(prim_pos))
             self.best = self.tested(self.arrays.leaves, jnp.uint32(prim_pos), self.ray, self.best)
             return
-        against = not int(self.ray.mirror) >> int(prim_count & 3) & 1
+        against = not int(self.ray.octant) >> int(prim_count & 3) & 1
         near = 2 * node + (against != self.far_first)
         self.visit(near)
         self.visit(near ^ 1)
