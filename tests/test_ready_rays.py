@@ -1,4 +1,4 @@
-"""Rays as they are made ready, many at once: the same as each alone, and the root's lanes those of a slow twin."""
+"""Rays made ready, many at once: the same as each alone, and the root's lanes those of a slow twin."""
 
 import numpy as np
 import pytest

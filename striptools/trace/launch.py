@@ -15,7 +15,7 @@ from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout, Rays
-from striptools.trace.leaves import aligned_full
+from striptools.trace.leaves import aligned_zeros
 from striptools.trace.triangle_tests import wants_way
 from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
 from striptools.trace.walk_packets import PacketScene
@@ -255,7 +255,7 @@ class _Pipe:
             yield self._collect()
 
     def _new(self) -> _Buffers:
-        rows = aligned_full(self._shape, 0.0)
+        rows = aligned_zeros(self._shape, np.float32)
         return _Buffers(rows, np.zeros((len(rows), *self._lanes), np.int32))
 
     def _send(self) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:

@@ -10,16 +10,15 @@ has run for a moment; what is compared are least times. `--everything` counts al
 """
 
 import argparse
-import os
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from cores import pin
 from results import Row, append
 
 import striptools
@@ -142,14 +141,6 @@ def await_quiet(end: float) -> None:
         )
         seen = seen + 1 if int(running.split()[1]) <= 1 else 0
         time.sleep(0.004)
-
-
-def pin(cores: set[int]) -> None:
-    """Let every thread of this process run on these cores only."""
-    for thread in os.listdir("/proc/self/task"):
-        # It may have ended meanwhile.
-        with suppress(ProcessLookupError):
-            os.sched_setaffinity(int(thread), cores)
 
 
 def together() -> float:

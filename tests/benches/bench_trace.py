@@ -1,13 +1,14 @@
-"""Tracing against embreex, and open3d where it is installed, in the same run, one thread each.
+"""Tracing against embreex, and open3d where it is installed, in the same run, all of it on one core.
 
     python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--hierarchy both] [--record]
-        [--note TEXT]
+        [--beside] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
 occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
 any hit. Random rays: 2**18 from anywhere in the model's bounds in any direction. Through the stored hierarchy
 of the scene, a rebuilt one, or both. The tracers take turns; a ratio is the median of the ratios of runs next
-to each other in time.
+to each other in time. The process stays on one core, or what the tracer does beside its walk would have
+another for nothing; `--beside` leaves it that. Linux only.
 """
 
 import os
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cores import pin
 from embreex import rtcore, rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from results import Row, append
@@ -102,16 +104,20 @@ def main() -> int:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--hierarchy", choices=("stored", "rebuilt", "both"), default="both")
+    parser.add_argument("--beside", action="store_true", help="host work may use another core")
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--note", default="")
     arguments = parser.parse_args()
+    if not arguments.beside:
+        pin({max(os.sched_getaffinity(0))})
+    where = "one thread, host work beside it" if arguments.beside else "one core"
     for path in arguments.models:
         scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
         kinds = ("stored", "rebuilt") if arguments.hierarchy == "both" else (arguments.hierarchy,)
         rows = [
             row
             for kind in kinds
-            for row in measure(path.stem, scene, kind, arguments.repeats, arguments.note)
+            for row in measure(path.stem, scene, kind, arguments.repeats, where, arguments.note)
         ]
         for row in rows:
             peer = f", {row.peer} {row.peer_value:.3g}, ratio {row.ratio:.3f}" if row.peer_value else ""
@@ -122,7 +128,9 @@ def main() -> int:
     return 0
 
 
-def measure(name: str, scene: Scene, hierarchy: HierarchyKind, repeats: int, note: str) -> list[Row]:
+def measure(
+    name: str, scene: Scene, hierarchy: HierarchyKind, repeats: int, where: str, note: str
+) -> list[Row]:
     """Build both tracers, then let them take turns on each kind of ray."""
     Tracer(scene, device="cpu", threads=1, hierarchy=hierarchy)
     start = time.perf_counter()
@@ -130,7 +138,7 @@ def measure(name: str, scene: Scene, hierarchy: HierarchyKind, repeats: int, not
     build = time.perf_counter() - start
     corners = scene.positions[scene.faces()]
     count = scene.triangle_count
-    note = "; ".join(filter(None, [f"{hierarchy} hierarchy", note]))
+    note = "; ".join(filter(None, [where, f"{hierarchy} hierarchy", note]))
     rows: list[Row] = []
     camera, anywhere = tiled_camera_rays(scene), random_rays(scene, RANDOM)
     occlusion: Rays | None = None
@@ -175,7 +183,7 @@ def _compare(
         count / min(column) / 1e6 for column in (list(zip(*times, strict=True))[k] for k in (1, 0))
     )
     ratio = statistics.median(peer / mine for peer, mine in times)
-    remark = "; ".join(filter(None, [f"{count} rays, one thread, same answer {same:.6f}", note]))
+    remark = f"{count} rays, same answer {same:.6f}; {note}"
     return Row("trace", name, triangles, metric, rate, "Mray/s", "embreex", peer_rate, ratio, remark)
 
 
