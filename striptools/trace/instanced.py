@@ -1,7 +1,7 @@
 """A scene with instances laid out for the walk: each geometry once, and a hierarchy over where they stand.
 
 What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances`
-says why. Cost beside the geometries: 80 bytes an instance, about 40 of the nodes over them, and size classes.
+says why. Cost beside the geometries: 230 bytes an instance, 40 of the nodes over them, and size classes.
 """
 
 from collections.abc import Iterator
@@ -23,6 +23,7 @@ from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
 from striptools.trace.layout import Found, Layout, PacketView, Rays
 from striptools.trace.leaves import aligned_full, lay_out_wide, scale_for, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
+from striptools.trace.standing import Places
 from striptools.trace.walk import DONE, WIDTH, Decode, Frame, WalkOptions
 from striptools.trace.walk_instances import InstancedScene, trace_instances
 
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
 MOST_SLIP = 0.25
 """The most of gamma_3 k + n for which rays are moved in float32: an instance more sheared is refused."""
+
+UPRIGHT = 1 - 2.0**-12
+"""The least l of `walk_points_instances` for which a geometry's boxes are looked at along its own axes."""
 
 OTHER_SLIPS = 4 * U
 """Roundings of an instance's box."""
@@ -82,6 +86,7 @@ class Moves:
         matrices: (k, 3, 4) float32, from the scaled scene to the scaled geometry.
         slips: (k,) float64, how far a hit may be from the ray, in units of the largest coordinate of ray
             origin and scene: f of `walk_instances`; infinite where float32 will not do.
+        places: (k, 3, 4) float64, from the scaled geometry to the scaled scene.
         boxes: (k, 6) float64, of the instances, scaled.
         scale: Of the scene, a power of two.
         reach: The largest scaled coordinate of the scene.
@@ -89,6 +94,7 @@ class Moves:
 
     matrices: Float32[np.ndarray, "k 3 4"]
     slips: Float64[np.ndarray, " k"]
+    places: Float64[np.ndarray, "k 3 4"]
     boxes: Float64[np.ndarray, "k 6"]
     scale: np.float32
     reach: float
@@ -147,6 +153,7 @@ class InstancedLayout:
         """Bytes of all arrays."""
         arrays = self.arrays
         above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches, self.numbers.geometry)
+        above = (*above, *arrays.places, arrays.bounds)
         above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
@@ -155,17 +162,23 @@ class InstancedLayout:
         """Those of the geometries."""
         return self.geometries.shared_bytes
 
-    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A name alone does not tell the instance."""
-        return self.named(names)[:2]
+    def named(
+        self, names: np.ndarray, instance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles of the flattened scene, and turns of corners where they stand."""
+        assert instance is not None
+        own_face, own_triangle, turns = self.geometries.named(names)
+        turns = np.where(self.mirrored[instance], (3 - turns) % 3, turns)
+        return *self._flattened(own_face, own_triangle, instance), turns
 
-    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A name alone does not tell the instance."""
-        raise UsageError(
-            "a triangle's name does not tell its instance",
-            where="instances",
-            remedy="use instances flattened",
-        )
+    def _flattened(
+        self, own_face: np.ndarray, own_triangle: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Faces and triangles of the flattened scene from those of geometries."""
+        geometry, numbers = self.numbers.geometry[instance], self.numbers
+        face = own_face + (numbers.first_face[instance] - self.first_face[geometry])
+        triangle = own_triangle + (numbers.first_triangle[instance] - self.first_triangle[geometry])
+        return face.astype(np.int32), triangle.astype(np.int32)
 
     def stream(
         self, scene: Any, rays: Rays, mesh: Mesh, options: WalkOptions
@@ -189,12 +202,9 @@ class InstancedLayout:
             local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
         given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
         self.geometries.weigh(local, *given, inside)
-        geometry, turned = self.numbers.geometry[instance], self.mirrored[instance]
-        face[rows] = own_face + (self.numbers.first_face[instance] - self.first_face[geometry])
-        triangle[rows] = own_triangle + (
-            self.numbers.first_triangle[instance] - self.first_triangle[geometry]
-        )
+        face[rows], triangle[rows] = self._flattened(own_face, own_triangle, instance)
         if len(u):
+            turned = self.mirrored[instance]
             u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
 
     def moved(
@@ -262,6 +272,9 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         # Planes of packed boxes are counted from the scene's low, whatever the geometry.
         reaches[:] = float(geometries.arrays.frame.reach)
     geometry, size = numbers.geometry, size_class(len(scene.instances))
+    starts = scene.spans.face_starts[:-1].astype(np.int64)
+    first_face = starts if scene.remap is None else scene.geometries.first_face
+    mirrored = scene.instances.placed.mirrored
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     arrays = InstancedScene(
         nodes,
@@ -270,16 +283,21 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         _padded(reaches[geometry].astype(np.float32), size),
         Frame(moves.scale, np.float32(moves.reach), zero, one, MARGIN),
         geometries.arrays,
+        Places(
+            _padded(moves.places.view(np.int32).reshape(-1, 3, 4, 2), size),
+            _padded(mirrored, size),
+            _padded((numbers.first_face - first_face[geometry]).astype(np.int32), size),
+        ),
+        _padded(stretch_bounds(moves.places), size),
     )
-    starts = scene.spans.face_starts[:-1].astype(np.int64)
     return InstancedLayout(
         arrays,
         geometries,
         max(wide.depth, geometries.depth),
         numbers,
         starts,
-        starts if scene.remap is None else scene.geometries.first_face,
-        scene.instances.placed.mirrored,
+        first_face,
+        mirrored,
     )
 
 
@@ -309,7 +327,7 @@ def moves_of(scene: "Scene", geometry_boxes: Float64[np.ndarray, "g 6"]) -> Move
         extent = np.abs(geometry_boxes).max(axis=1)[geometry] * inner
         slips = _slips(a, b, matrices.astype(np.float64), extent, reach)
     slips[~np.isfinite(matrices).all(axis=(1, 2))] = np.inf
-    return Moves(matrices, slips, boxes, scale, reach)
+    return Moves(matrices, slips, np.concatenate([a, b[:, :, None]], axis=2), boxes, scale, reach)
 
 
 def _inverted(a: np.ndarray) -> np.ndarray:
@@ -341,6 +359,32 @@ def _slips(
     off = (gamma_4 * k + n + 2 * slip + gamma_4 * h + r) / (1 - slip)
     test = REACH * (k + h + row_sum(np.abs(a)) * extent / reach)
     return np.where(slip < MOST_SLIP, (off + test + OTHER_SLIPS) * (1 + 2.0**-10), np.inf)
+
+
+def stretch_bounds(places: Float64[np.ndarray, "k 3 4"]) -> Float32[np.ndarray, "k 3 4"]:
+    """Axes of each geometry, and how much each is stretched along them at least (`walk_points_instances`).
+
+    In three rows for each: an axis v, and w. Of any vector y of the geometry what it becomes is no shorter
+    than that of the lengths w (v . y).
+    """
+    matrix = places[:, :, :3]
+    axes = np.tile(np.eye(3, dtype=np.float32), (len(matrix), 1, 1))
+    least, length = _stretches(matrix)
+    sheared = np.flatnonzero(least < UPRIGHT)
+    if len(sheared):
+        axes[sheared] = np.linalg.svd(matrix[sheared])[2].astype(np.float32)
+        least[sheared], length[sheared] = _stretches(
+            matrix[sheared] @ np.linalg.inv(axes[sheared].astype(np.float64))
+        )
+    stretch = np.sqrt(np.maximum(least, 0))[:, None] * length * (1 - 2.0**-20)
+    return np.concatenate([axes, stretch[:, :, None].astype(np.float32)], axis=2)
+
+
+def _stretches(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the columns of matrices (k, 3, 3): l of `walk_points_instances`, no more than it is, and lengths."""
+    length = np.linalg.norm(matrix, axis=1)
+    upright = matrix / length[:, None, :]
+    return np.linalg.eigvalsh(np.swapaxes(upright, 1, 2) @ upright)[:, 0] - 2.0**-40, length
 
 
 def _expanded(scene: "Scene", threads: int) -> tuple[Layout, np.ndarray]:

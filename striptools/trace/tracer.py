@@ -390,7 +390,7 @@ class Tracer:
 
         Where on its triangle it is, and how far, is computed in float64. Which triangle it is was decided in
         float32: none is closer by more than 2**-20 of the largest coordinate of point and scene. Of equal
-        ones it is the least face.
+        ones it is the least face. Through shared instances it is bit for bit that of the flattened scene.
 
         Args:
             points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times
@@ -398,14 +398,14 @@ class Tracer:
             signed: Make distances negative inside, by `contains` by parity: for closed meshes.
 
         Raises:
-            UsageError: The points are not of this shape, or instances are shared.
+            UsageError: The points are not of this shape.
             StriptoolsError: As for `closest_hit`.
         """
         checked = checked_points(points)
         if self._empty:
             found = nothing_closest(len(checked))
         else:
-            wide = self._wide_nodes("closest points do not")
+            wide = self._gatherer()
             options = PointOptions(wide._stack_size, wide._on_gpu, wide._layout.decode)
             found = closest_points(wide._scene, wide._layout, checked, wide._mesh, options)
         if signed:

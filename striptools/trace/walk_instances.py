@@ -47,6 +47,7 @@ from jax import Array, lax
 from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import in_range, index, larger, rounded
+from striptools.trace.standing import Places, Standing, standing
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
@@ -84,6 +85,8 @@ class InstancedScene(NamedTuple):
         reaches: (k,) float32, the largest scaled coordinate of its geometry.
         frame: How rays are seen from the scene.
         geometries: All geometries, in their own frames.
+        places: Where instances stand.
+        bounds: (k, 3, 4) float32, three axes V of each geometry and stretches w (`walk_points_instances`).
     """
 
     nodes: Any
@@ -92,6 +95,44 @@ class InstancedScene(NamedTuple):
     reaches: Any
     frame: Frame
     geometries: Any
+    places: Places
+    bounds: Any
+
+    @property
+    def node_count(self) -> int:
+        """Nodes over instances."""
+        return len(self.nodes)
+
+    @property
+    def width(self) -> int:
+        """Children of a node."""
+        return WIDTH
+
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: boxes of instances or of several, scaled and not widened; NaN in empty lanes."""
+        return self.rows_of(node)[:6]
+
+    def rows_of(self, node: Array) -> Array:
+        """(8, 8) float32: a node."""
+        at = (index(node), jnp.uint32(0), jnp.uint32(0))
+        return lax.dynamic_slice(self.nodes, at, (1, 8, WIDTH))[0]
+
+    def child_of(self, node: Array, lane: Array) -> Array:
+        """The child in a lane; instance i is -(i + 1)."""
+        bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
+        return lax.bitcast_convert_type(bits, jnp.int32)
+
+    def find_leaf(self, child: Array) -> Array:
+        """The child."""
+        return child
+
+    def root_of(self, instance: Array) -> Array:
+        """The root of an instance's geometry."""
+        return value_at(self.roots, index(instance))
+
+    def standing(self, instance: Array) -> Standing:
+        """An instance where it stands."""
+        return standing(self.geometries, self.places, instance)
 
     def visited(self, top: Array, below: Array) -> Array:
         """(6,) int32, `Counters` of so many nodes, leaves and triangles over instances and in geometries."""
@@ -189,28 +230,26 @@ class _Seen(NamedTuple):
     @property
     def width(self) -> int:
         """Children of a node."""
-        return WIDTH
+        return self.scene.width
 
     @property
     def node_count(self) -> int:
         """Nodes over instances."""
-        return len(self.scene.nodes)
+        return self.scene.node_count
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose widened boxes the ray meets, from 0 to `limit`."""
-        at = (index(node), jnp.uint32(0), jnp.uint32(0))
-        rows = lax.dynamic_slice(self.scene.nodes, at, (1, 8, WIDTH))[0]
+        rows = self.scene.rows_of(node)
         wider = rows[7] * self.size
         return lanes_met(jnp.concatenate([rows[:3] - wider, rows[3:6] + wider]), slab, limit)
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; instance i is -(i + 1)."""
-        bits = lax.dynamic_slice(self.scene.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
-        return lax.bitcast_convert_type(bits, jnp.int32)
+        return self.scene.child_of(node, lane)
 
     def find_leaf(self, child: Array) -> Array:
         """The child."""
-        return child
+        return self.scene.find_leaf(child)
 
     def triangles_of(self, where: Array) -> Array:
         """Triangles are counted in the geometries."""
@@ -220,15 +259,14 @@ class _Seen(NamedTuple):
         """Walk the geometry of an instance."""
         number = -(where + 1)
         at = index(number)
-        matrix = lax.dynamic_slice(self.scene.matrices, (at, jnp.uint32(0), jnp.uint32(0)), (1, 3, 4))[0]
-        origin, direction = moved(matrix, self.origin, self.direction)
+        origin, direction = moved(row_of(self.scene.matrices, at), self.origin, self.direction)
         geometries = self.scene.geometries
-        frame = geometries.frame._replace(scale=jnp.float32(1), reach=_at(self.scene.reaches, at))
+        frame = geometries.frame._replace(scale=jnp.float32(1), reach=value_at(self.scene.reaches, at))
         seen = geometries._replace(frame=frame)
         # A GPU goes through the motions for rays that are at no leaf.
         there = (where < 0) & (where != DONE)
         limit = jnp.where(there, best.limit, 0)
-        row = prepared_ray(seen, origin, direction, limit, _at(self.scene.roots, at))
+        row = prepared_ray(seen, origin, direction, limit, value_at(self.scene.roots, at))
         return best.after(number, seen, walk_alone(seen, row, options), options)
 
 
@@ -291,8 +329,14 @@ def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOption
     return InstancesTraced(t, name, counters, counted, instance)
 
 
-def _at(values: Array, place: Array) -> Array:
+def value_at(values: Array, place: Array) -> Array:
+    """One of (k,) values."""
     return lax.dynamic_slice(values, (place,), (1,))[0]
+
+
+def row_of(rows: Array, place: Array) -> Array:
+    """One of k rows."""
+    return lax.dynamic_index_in_dim(rows, place, keepdims=False)
 
 
 def _next_above(value: Array) -> Array:

@@ -17,6 +17,8 @@ that of the triangle found is at most 2**-20 of the largest coordinate of point 
 which the tests hold against float64.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +28,7 @@ from jax import Array, lax
 
 from striptools.trace.numerics import folded, index, larger, rounded, smaller
 from striptools.trace.triangle import pick
-from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, WIDTH, Decode, Leaf, WalkScene
+from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, WIDTH, Decode, Frame, Leaf, WalkScene
 
 FARTHEST = np.float32(2.0**60)
 """The largest scaled coordinate of a point that can be looked from: squares stay finite."""
@@ -44,11 +46,30 @@ class Nearest(NamedTuple):
     lane: Array
 
 
-class _State(NamedTuple):
+class Searched(NamedTuple):
+    """Where a search is, or where it ended: without one step too many only at a height of 0."""
+
     stack: Array
     height: Array
     turns: Array
-    nearest: Nearest
+    nearest: Any
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search from a point goes through: nodes, and leaves of triangles or of something else.
+
+    Attributes:
+        scene: Whose nodes they are: of `WalkScene` `width`, `node_count`, `child_of` and `find_leaf`.
+        squares_of: From a node, the squares of the distances of its children, (width,) float32, at most the
+            true ones; not a number in empty lanes.
+        visit: From a leaf as a node names it, what `find_leaf` says of it, and the closest so far, which has
+            a `square`, the closest after it.
+    """
+
+    scene: Any
+    squares_of: Callable[[Array], Array]
+    visit: Callable[[Array, Any, Any], Any]
 
 
 class PointOptions(NamedTuple):
@@ -66,56 +87,94 @@ class Closest(NamedTuple):
     corners: Array
 
 
-def closest_triangles(scene: WalkScene, points: Array, options: PointOptions) -> Closest:
-    """Walk from r points.
+def closest_triangles(scene: Any, points: Array, options: PointOptions, walk_one: Any = None) -> Any:
+    """Walk from r points: a `Closest`, or what another walk finds.
 
     Args:
-        scene: What to search.
+        scene: What to search, a `WalkScene`.
         points: (r, 4) float32, scaled coordinates, and 1; a row of zeros ends at once.
         options: What to compile in.
+        walk_one: From scene, point, stack and options the stack and what is found; None for `walk_point`.
     """
     floor = jnp.zeros((options.stack_size, 2), jnp.int32)
+    walk_one = walk_one or walk_point
 
-    def walk(stack: Array, point: Array) -> tuple[Array, Closest]:
-        return _walk(scene, point, stack, options)
+    def walk(stack: Array, point: Array) -> tuple[Array, Any]:
+        return walk_one(scene, point, stack, options)
 
     if options.batch:
         return jax.vmap(lambda point: walk(floor, point)[1])(points)
     return lax.scan(walk, floor, points)[1]
 
 
-def _walk(scene: WalkScene, point: Array, stack: Array, options: PointOptions) -> tuple[Array, Closest]:
+def walk_point(scene: WalkScene, point: Array, stack: Array, options: PointOptions) -> tuple[Array, Closest]:
+    """Walk from one point; the stack may hold anything, and serves the next."""
     at = (point[0], point[1], point[2])
-    size = larger(larger(jnp.abs(at[0]), jnp.abs(at[1])), larger(jnp.abs(at[2]), scene.frame.reach))
-    margin = scene.frame.margin * size
-    root = jnp.array([0, 2**scene.width - 1], jnp.int32)
-    stack = lax.dynamic_update_slice(stack, root[None], (jnp.uint32(0), jnp.uint32(0)))
-    height = jnp.where(point[3] > 0, jnp.int32(1), jnp.int32(0))
-    none = (jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME, DONE, np.int32(0)))
-    nothing = Nearest(*none)
+    search = search_of(scene, at, margin_of(scene.frame, at), options.decode)
+    end = searched(search, jnp.int32(0), point[3] > 0, stack, nothing_near())
+    name = jnp.where(end.height > 0, STUCK, end.nearest.name)
+    return end.stack, Closest(name, corners_of(scene, name >= 0, end.nearest, options.decode))
 
-    def goes_on(state: _State) -> Array:
+
+def margin_of(frame: Frame, at: Vector) -> Array:
+    """What boxes are widened by, for a point."""
+    size = larger(larger(jnp.abs(at[0]), jnp.abs(at[1])), larger(jnp.abs(at[2]), frame.reach))
+    return frame.margin * size
+
+
+def nothing_near() -> Nearest:
+    """What is closest before anything is looked at."""
+    return Nearest(*(jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME, DONE, np.int32(0))))
+
+
+def search_of(scene: WalkScene, at: Vector, margin: Array, decode: Decode | None) -> Search:
+    """The search for the closest triangle of a scene."""
+
+    def squares_of(node: Array) -> Array:
+        return box_squares(scene.boxes_of(node), at, (margin, margin, margin))
+
+    return Search(scene, squares_of, visits_of(scene, at, decode))
+
+
+def visits_of(scene: WalkScene, at: Vector, decode: Decode | None) -> Callable[[Array, Any, Any], Nearest]:
+    """The `visit` of a search for the closest triangle."""
+
+    def visit(child: Array, where: Any, nearest: Nearest) -> Nearest:
+        return _visit_leaf(scene, at, child, where, nearest, decode)
+
+    return visit
+
+
+def searched(search: Search, root: Array, there: Array, stack: Array, nearest: Any) -> Searched:
+    """Search from a node on, where there is anything to search; `stack` may hold anything."""
+    width = search.scene.width
+    first = jnp.stack([root, jnp.int32(2**width - 1)])
+    stack = lax.dynamic_update_slice(stack, first[None], (jnp.uint32(0), jnp.uint32(0)))
+    height = jnp.where(there, jnp.int32(1), jnp.int32(0))
+
+    def goes_on(state: Searched) -> Array:
         # A node is visited once for each child, and left.
-        return (state.height > 0) & (state.turns <= (1 + scene.width) * scene.node_count)
+        return (state.height > 0) & (state.turns <= (1 + width) * search.scene.node_count)
 
-    def turn(state: _State) -> _State:
-        return _turn(scene, at, margin, state, options.decode)
-
-    state = lax.while_loop(goes_on, turn, _State(stack, height, jnp.int32(0), nothing))
-    name = jnp.where(state.height > 0, STUCK, state.nearest.name)
-    found = name >= 0
-    where = scene.find_leaf(jnp.where(found, state.nearest.leaf, -1))
-    leaf = _leaf(scene, where, options.decode)
-    held = jnp.arange(WIDTH, dtype=jnp.int32) == state.nearest.lane
-    corners = [jnp.where(held & found, lanes, 0).sum() for axis in (leaf.x, leaf.y, leaf.z) for lanes in axis]
-    return state.stack, Closest(name, jnp.stack(corners))
+    return lax.while_loop(
+        goes_on, lambda state: _turn(search, state), Searched(stack, height, jnp.int32(0), nearest)
+    )
 
 
-def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: Decode | None) -> _State:
+def corners_of(scene: WalkScene, found: Array, nearest: Nearest, decode: Decode | None) -> Array:
+    """(9,) float32: corners a, b, c of the closest triangle, scaled, x first; zeros where there is none."""
+    leaf = _leaf(scene, scene.find_leaf(jnp.where(found, nearest.leaf, -1)), decode)
+    held = jnp.arange(WIDTH, dtype=jnp.int32) == nearest.lane
+    axes = (leaf.x, leaf.y, leaf.z)
+    return jnp.stack([jnp.where(held & found, lanes, 0).sum() for axis in axes for lanes in axis])
+
+
+def _turn(search: Search, state: Searched) -> Searched:
     """Visit the nearest lane left of the node on top, or leave the node."""
+    scene = search.scene
     top = index(state.height - 1)
     node, lanes = lax.dynamic_slice(state.stack, (top, jnp.uint32(0)), (1, 2))[0]
-    squares = box_squares(scene.boxes_of(node), at, margin)
+    squares = search.squares_of(node)
     order = jnp.arange(scene.width, dtype=jnp.int32)
     left = (lanes >> order & 1 != 0) & (squares <= state.nearest.square)
     squares = jnp.where(left, squares, jnp.float32(jnp.inf))
@@ -133,17 +192,21 @@ def _turn(scene: WalkScene, at: Vector, margin: Array, state: _State, decode: De
     stack = lax.dynamic_update_slice(stack, below[None], (above, jnp.uint32(0)))
     at_leaf = (child < 0) & (child != DONE)
     where = scene.find_leaf(child)
-    nearest = lax.cond(
-        at_leaf, lambda: _visit_leaf(scene, at, child, where, state.nearest, decode), lambda: state.nearest
-    )
-    return _State(stack, height, state.turns + 1, nearest)
+    nearest = lax.cond(at_leaf, lambda: search.visit(child, where, state.nearest), lambda: state.nearest)
+    return Searched(stack, height, state.turns + 1, nearest)
 
 
-def box_squares(boxes: Array, at: Vector, margin: Array) -> Array:
-    """(k,) float32: squares of the distances from a point to boxes (6, k), at most the true ones."""
+def box_squares(boxes: Array, at: Vector, margins: Vector) -> Array:
+    """(k,) float32: squares of the distances from a point to boxes (6, k), at most the true ones.
+
+    Args:
+        boxes: Lo xyz and hi xyz; not a number where there is none.
+        at: The point.
+        margins: By how much boxes are widened along x, y and z.
+    """
     total = jnp.zeros(boxes.shape[1:], jnp.float32)
     for axis in range(3):
-        outside = larger(boxes[axis] - at[axis], at[axis] - boxes[axis + 3]) - margin
+        outside = larger(boxes[axis] - at[axis], at[axis] - boxes[axis + 3]) - margins[axis]
         # Not smaller or larger: NaN, of an empty lane, must stay.
         outside = jnp.where(outside < 0, jnp.float32(0), outside)
         total = total + outside * outside
