@@ -376,7 +376,6 @@ def test_what_cannot_be_done_is_refused(crowd):
     rays = rays_through(scene, 2)
     for call in (
         lambda: tracer.contains(rays[0], method="winding"),
-        lambda: Tracer(scene, device="cpu", instances="shared", test="exact-sign"),
         lambda: tracer.winding_numbers(rays[0]),
         lambda: tracer.program_parts(),
     ):

@@ -21,7 +21,7 @@ from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
 from striptools.trace.layout import Found, Layout, PacketView, Rays
-from striptools.trace.leaves import aligned_full, lay_out_wide, scale_for, scale_of, size_class
+from striptools.trace.leaves import LeafBlocks, aligned_full, lay_out_wide, scale_for, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.standing import Places
 from striptools.trace.walk import DONE, WIDTH, Decode, Frame, WalkOptions
@@ -117,6 +117,7 @@ class InstancedLayout:
         first_triangle: (g,) int64, the first triangle in file order of each geometry.
         first_face: (g,) int64, its first source face; triangle without a remap.
         mirrored: (k,) bool, which instances turn the winding of faces.
+        in_place: Whether rays meet triangles where they stand, and are not moved for them.
     """
 
     arrays: InstancedScene
@@ -126,6 +127,7 @@ class InstancedLayout:
     first_triangle: np.ndarray
     first_face: np.ndarray
     mirrored: np.ndarray
+    in_place: bool = False
 
     @property
     def decode(self) -> Decode | None:
@@ -153,7 +155,7 @@ class InstancedLayout:
         """Bytes of all arrays."""
         arrays = self.arrays
         above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches, self.numbers.geometry)
-        above = (*above, *arrays.places, arrays.bounds)
+        above = (*above, *arrays.places, arrays.slips, arrays.bounds)
         above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
@@ -186,26 +188,54 @@ class InstancedLayout:
         """Trace any number of rays; yield slices of them and results, in order."""
         yield from stream_through(instances_program(mesh, options), scene, rays, mesh, GPU_TILES)
 
+    def corners_of(
+        self, names: np.ndarray, instance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`; corners where they stand, as `standing` places them."""
+        assert instance is not None
+        own, turns = self.geometries.corners_of(names)
+        matrix = self.arrays.places.matrices.view(np.float64)[instance, :, :, 0, None]
+        x, y, z = (own[:, None, axis].astype(np.float64) for axis in range(3))
+        placed = ((matrix[:, :, 0] * x + matrix[:, :, 1] * y) + matrix[:, :, 2] * z) + matrix[:, :, 3]
+        corners = placed.astype(np.float32)
+        corners[np.abs(corners) < np.finfo(np.float32).tiny] = 0
+        mirrored = self.mirrored[instance]
+        corners[mirrored] = corners[mirrored][:, :, [0, 2, 1]]
+        turns = np.where(mirrored, (3 - turns) % 3, turns)
+        first = _first_corners(corners)
+        order = (np.arange(3) + first[:, None]) % 3
+        return np.take_along_axis(corners, order[:, None], axis=2), ((turns + first) % 3).astype(np.int32)
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle of the flattened scene."""
         t, face, u, v, triangle = found
-        instance = traced[4]
-        hit = np.flatnonzero(instance >= 0)
+        hit = np.flatnonzero(traced[4] >= 0)
         t[at] = traced[0]
-        instance, rows = instance[hit], at[hit]
-        own_t, own_face, own_u, own_v, own_triangle = (
-            np.zeros(min(len(hit), len(one)), one.dtype) for one in found
-        )
-        inside = (own_t, own_face, own_u, own_v, own_triangle)
-        local = rays
+        rows, names, instance = at[hit], traced[1][hit], traced[4][hit]
+        face[rows], triangle[rows], _ = self.named(names, instance)
         if len(u):
-            local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
-        given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
-        self.geometries.weigh(local, *given, inside)
-        face[rows], triangle[rows] = self._flattened(own_face, own_triangle, instance)
-        if len(u):
-            turned = self.mirrored[instance]
-            u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
+            weights = self._weights_in_place if self.in_place else self._weights_moved
+            u[rows], v[rows] = weights((rays[0][rows], rays[1][rows], rays[2][rows]), names, instance)
+
+    def _weights_moved(
+        self, rays: Rays, names: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """U and v of rays that hit these triangles, as they are moved into their geometries."""
+        u, v = _weights_by(self.geometries, (*self.moved(rays[0], rays[1], instance), rays[2]), names)
+        turned = self.mirrored[instance]
+        return np.where(turned, v, u), np.where(turned, u, v)
+
+    def _weights_in_place(
+        self, rays: Rays, names: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same of rays that are not moved, and of triangles where they stand."""
+        corners, turns = self.corners_of(names, instance)
+        count = len(names)
+        lanes = _padded(corners.reshape(count, 9), -(-count // WIDTH) * WIDTH)
+        blocks = lanes.reshape(-1, WIDTH, 9).transpose(0, 2, 1).copy()
+        place = np.arange(count, dtype=np.int32) * 4 + turns
+        held = LeafBlocks(blocks, place, np.zeros(0, np.int32), self.arrays.frame.scale)
+        return _weights_by(held, rays, np.arange(count, dtype=np.int32))
 
     def moved(
         self, origins: np.ndarray, directions: np.ndarray, instance: np.ndarray
@@ -218,6 +248,25 @@ class InstancedLayout:
             origin = _turned(matrix, origins * self.arrays.frame.scale) + matrix[:, :, 3]
             scale = self.geometries.arrays.frame.scale
             return origin / scale, _turned(matrix, shortened)
+
+
+def _weights_by(layout: Layout | LeafBlocks, rays: Rays, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """U and v of rays that hit what is so named in a layout."""
+    count = len(names)
+    t, u, v = np.zeros((3, count), np.float32)
+    face, triangle = np.zeros((2, count), np.int32)
+    layout.weigh(rays, np.arange(count, dtype=np.int32), (t, names), (t, face, u, v, triangle))
+    return u, v
+
+
+def _first_corners(corners: np.ndarray) -> np.ndarray:
+    """(k,): which corner of (k, 3, 3), a row an axis, is the least by (x, y, z), the first of equals."""
+    rows, first = np.arange(len(corners)), np.zeros(len(corners), np.int64)
+    for j in (1, 2):
+        here, there = corners[rows, :, first], corners[:, :, j]
+        axis = (here != there).argmax(axis=1)
+        first = np.where(there[rows, axis] < here[rows, axis], j, first)
+    return first
 
 
 def _turned(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -239,7 +288,9 @@ def instances_program(mesh: Mesh, options: WalkOptions) -> Any:
     return jax.jit(split)
 
 
-def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = False) -> InstancedLayout:
+def lay_out_instanced(
+    scene: "Scene", threads: int = 1, *, compressed: bool = False, in_place: bool = False
+) -> InstancedLayout:
     """Lay a scene with instances out, each geometry once.
 
     Args:
@@ -247,6 +298,7 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         threads: Threads to build with.
         compressed: Keep the blocks as they lie, under the hierarchy of the file; else geometries are
             expanded, under new hierarchies.
+        in_place: See `InstancedLayout`.
 
     Raises:
         UsageError: An instance is so sheared, so small or so far from its geometry's origin that float32
@@ -288,6 +340,7 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
             _padded(mirrored, size),
             _padded((numbers.first_face - first_face[geometry]).astype(np.int32), size),
         ),
+        _padded((moves.slips * (1 + 2 * U)).astype(np.float32), size),
         _padded(stretch_bounds(moves.places), size),
     )
     return InstancedLayout(
@@ -298,6 +351,7 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         starts,
         first_face,
         mirrored,
+        in_place,
     )
 
 

@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from striptools.trace.box import Slab
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Corners, pick
+from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.triangle_tests import IN_DOUBLE
-from striptools.trace.walk import Decode, Leaf
+from striptools.trace.walk import Best, Decode, Leaf, WalkOptions, found_any, nearer
 from striptools.trace.walk_packed import _first_corner as first_corner
 
 
@@ -63,6 +64,15 @@ class Standing(NamedTuple):
         """Nodes of all geometries."""
         return self.geometries.node_count
 
+    @property
+    def has_faces(self) -> bool:
+        """Whether names are triangles in file order, and faces something else."""
+        return self.geometries.has_faces
+
+    def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
+        """(width,) bool: the node's children whose boxes a ray meets, the slab of the ray as it is moved."""
+        return self.geometries.lanes_met(node, slab, limit)
+
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane."""
         return self.geometries.child_of(node, lane)
@@ -70,6 +80,10 @@ class Standing(NamedTuple):
     def find_leaf(self, child: Array) -> Any:
         """Where the triangles of a leaf are."""
         return self.geometries.find_leaf(child)
+
+    def triangles_of(self, where: Any) -> Array:
+        """() int32: how many triangles a leaf has."""
+        return self.geometries.triangles_of(where)
 
     def faces_of(self, names: Array) -> Array:
         """(8,) int32: the flattened source's faces; some number where there is none."""
@@ -80,8 +94,24 @@ class Standing(NamedTuple):
         own = self.geometries.leaf_of(tuple(jnp.uint32(axis) for axis in range(3)), where, decode)
         filled = ~jnp.isnan(own.x[0]) if own.filled is None else own.filled
         x, y, z = lax.optimization_barrier(self._placed((own.x, own.y, own.z)))
-        along = [tuple(pick(corner, axis) for corner in zip(x, y, z, strict=True)) for axis in axes]
-        return Leaf(along[0], along[1], along[2], first_corner(x, y, z), filled, own.name)
+
+        def along(axis: Array) -> Corners:
+            a, b, c = (pick(corner, axis) for corner in zip(x, y, z, strict=True))
+            return a, b, c
+
+        return Leaf(along(axes[0]), along(axes[1]), along(axes[2]), first_corner(x, y, z), filled, own.name)
+
+    def visit_leaf(self, shear: Shear, where: Any, best: Best, options: WalkOptions) -> Best:
+        """Test the triangles of a leaf where they stand, against the closest hit so far."""
+
+        def placed() -> Leaf:
+            return self.leaf_of(shear.axes, where, options.decode)
+
+        leaf = placed()
+        t = leaf.crossings(shear, test=options.test, again=placed)
+        if options.any_hit:
+            return found_any(best, t)
+        return nearer(best, t, leaf.name, self.geometries.faces_of if self.has_faces else None)
 
     def residual(self, own: Array, point: Array) -> tuple[Array, Array]:
         """By how much a point of the geometry (3,) stands beside one of the scene, computed in float64.

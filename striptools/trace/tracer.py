@@ -70,8 +70,10 @@ class Tracer:
     In a scene with instances a hit's face is that of the flattened source (`Mesh.flattened` of the mesh that
     was converted), its triangle one of `scene.placed()`; instance, geometry and the face within it are told
     beside. "shared" keeps each geometry once and moves rays into its frame: inside each instance as
-    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). Where
-    geometries are expanded, `hierarchy` is always rebuilt.
+    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). What is
+    asked by another triangle test, and closest points, are the bits of the flattened scene: triangles are
+    put where they stand as they are met (`standing`). Where geometries are expanded, `hierarchy` is always
+    rebuilt.
 
     A scene under a hierarchy of its own (SLBVH, kd-tree, presorted, loose octree) is walked through that for
     closest and any hits. All other queries go through wide nodes, rebuilt on the first of them, and so they
@@ -97,11 +99,8 @@ class Tracer:
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
-            geometry once, for all that is asked of rays: hits, counts, and `contains` by parity. What is
-            measured where triangles stand, closest points and winding numbers, needs "flattened", and so do
-            triangle tests other than the default one, since rays are rounded as they are moved. "auto"
-            flattens what fits in `memory_budget`, and shares where it does not or where `resident` is
-            compressed.
+            geometry once. "auto" flattens what fits in `memory_budget`, and shares where it does not or where
+            `resident` is compressed.
         test: How a ray and a triangle are tested (`trace.triangle_tests`; bounds in `measure.bound`):
             "watertight" lets no ray slip through a closed surface, and counts as hit what is as near to it as
             float32 rounds; "fast" is Moeller and Trumbore's, which leaks; "exact-sign" hits exactly what
@@ -149,8 +148,6 @@ class Tracer:
         self._numbers = None if scene.instances is None else InstanceNumbers.of(scene)
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
-            if test != "watertight":
-                self._refuse_shared(f"triangle test {test} does not")
         beside = not self._empty and not self._shared and not self._has_each_once
         self._rebuild = partial(self._with_each_once, scene, device, threads) if beside else None
 
@@ -201,7 +198,8 @@ class Tracer:
         if scene.hierarchy is not None and hierarchy == "stored":
             return lay_out_alternative(scene, scene.hierarchy, threads)
         if self._shared:
-            return lay_out_instanced(scene, threads, compressed=self._resident == "compressed")
+            compressed, in_place = self._resident == "compressed", self._test != "watertight"
+            return lay_out_instanced(scene, threads, compressed=compressed, in_place=in_place)
         if self._resident == "compressed":
             return lay_out_packed(scene, threads)
         if hierarchy == "stored":
@@ -312,7 +310,7 @@ class Tracer:
         told = (t, face, u[:0], v[:0], triangle) if in_double else found
         self._layout.weigh(rays, at, traced, told)
         if in_double:
-            weigh_in_double(self._layout, rays, at, traced[1], found)
+            weigh_in_double(self._layout, rays, at, traced, found)
         elif len(u) > 0 and self._test == "fast":
             weights_inside(at, found)
 

@@ -14,6 +14,11 @@ stack of its own, and the closest hit is carried back.
    in the order of instances.
 5. All hits are gathered in each geometry, as many as are asked for, and merged by t, instance and face;
    counts are summed. A mirrored instance counts windings the other way round, which parity does not see.
+6. Triangle tests other than the watertight one are of the ray as it is and of triangles where they stand
+   (`standing`): hits, t, u and v are the bits of the flattened scene. Only boxes are met by the moved ray. By
+   what follows, a place in a geometry that stands for a hit is, once put in the scene, within f s of what the
+   moved ray stands for there, and within 16 u s more, since corners are rounded and a test may report what
+   is beside the ray. Boxes are widened by that times the largest row sum of |W|.
 
 **Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w
 move a ray into it: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d the
@@ -42,18 +47,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from striptools.trace.box import Slab, lanes_met
+from striptools.trace.box import Slab, U, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import in_range, index, larger, rounded
+from striptools.trace.numerics import in_range, index, larger, power_of_two_below, rounded
 from striptools.trace.standing import Places, Standing, standing
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
+    FLOATS,
     MISS,
     STUCK,
     WIDTH,
+    WORDS,
     Alone,
     Frame,
     ReadyRay,
@@ -61,6 +69,7 @@ from striptools.trace.walk import (
     found_alone,
     largest_of,
     prepared_ray,
+    prepared_rays,
     scaled_ray,
     walk_alone,
 )
@@ -68,6 +77,13 @@ from striptools.trace.walk_gather import Gathered, bits_of, merged, nothing_gath
 
 NODE_BYTES = 256
 """What a node over instances reads: eight boxes, children, and factors."""
+
+SLAB = 9
+"""Words of a ready ray that are its slab, the first."""
+
+CORNER_SLIPS = np.float32(16 * U)
+"""How far a hit may be from the exact place of its triangle, in units of the largest coordinate: corners are
+rounded, and the test may report what is `box.REACH` beside the ray."""
 
 INSTANCE_BYTES = 60
 """What an instance reads: its matrix, root, reach and number."""
@@ -86,6 +102,7 @@ class InstancedScene(NamedTuple):
         frame: How rays are seen from the scene.
         geometries: All geometries, in their own frames.
         places: Where instances stand.
+        slips: (k,) float32, f of each instance.
         bounds: (k, 3, 4) float32, three axes V of each geometry and stretches w (`walk_points_instances`).
     """
 
@@ -96,6 +113,7 @@ class InstancedScene(NamedTuple):
     frame: Frame
     geometries: Any
     places: Places
+    slips: Any
     bounds: Any
 
     @property
@@ -258,16 +276,41 @@ class _Seen(NamedTuple):
     def visit_leaf(self, shear: Shear, where: Array, best: Any, options: WalkOptions) -> Any:
         """Walk the geometry of an instance."""
         number = -(where + 1)
-        at = index(number)
+        # A GPU goes through the motions for rays that are at no leaf.
+        there = (where < 0) & (where != DONE)
+        limit = jnp.where(there, best.limit, 0)
+        if options.test == "watertight":
+            seen, row = self._moved_into(index(number), limit)
+        else:
+            seen, row = self._standing_at(index(number), limit, shear)
+        return best.after(number, seen, walk_alone(seen, row, options), options)
+
+    def _moved_into(self, at: Array, limit: Array) -> tuple[Any, Array]:
+        """The geometry of an instance, and the ray ready in its frame."""
         origin, direction = moved(row_of(self.scene.matrices, at), self.origin, self.direction)
         geometries = self.scene.geometries
         frame = geometries.frame._replace(scale=jnp.float32(1), reach=value_at(self.scene.reaches, at))
         seen = geometries._replace(frame=frame)
-        # A GPU goes through the motions for rays that are at no leaf.
-        there = (where < 0) & (where != DONE)
-        limit = jnp.where(there, best.limit, 0)
-        row = prepared_ray(seen, origin, direction, limit, value_at(self.scene.roots, at))
-        return best.after(number, seen, walk_alone(seen, row, options), options)
+        return seen, prepared_ray(seen, origin, direction, limit, value_at(self.scene.roots, at))
+
+    def _standing_at(self, at: Array, limit: Array, shear: Shear) -> tuple[Any, Array]:
+        """An instance where it stands, and the ray: as it is moved for boxes, as it is for triangles."""
+        scene, matrix = self.scene, row_of(self.scene.matrices, at)
+        origin, direction = moved(matrix, self.origin, self.direction)
+        own = scene.geometries.frame
+        slip = (value_at(scene.slips, at) + CORNER_SLIPS) * self.size
+        wider = jnp.abs(matrix[:, :3]).sum(axis=1).max() * slip * np.float32(1 + 2.0**-18)
+        reach = larger(largest_of(origin), value_at(scene.reaches, at)) + wider / own.margin
+        seen = scene.geometries._replace(frame=own._replace(scale=jnp.float32(1), reach=reach))
+        row = prepared_ray(seen, origin, direction, limit, value_at(scene.roots, at))
+        # Distances of boxes in t of the walk over instances, whose direction is not made shorter here.
+        slab = row[:SLAB] * power_of_two_below(largest_of(direction))[0]
+        rest = jnp.stack([*shear.origin, shear.x, shear.y, shear.z, limit, jnp.float32(1)])
+        axes = lax.bitcast_convert_type(jnp.stack(shear.axes).astype(jnp.int32), jnp.float32)
+        row = jnp.concatenate([slab, rest, axes, row[FLOATS + 3 : WORDS]])
+        if shear.way is not None:
+            row = jnp.concatenate([row, jnp.stack(shear.way)])
+        return scene.standing(at), row
 
 
 def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]:
@@ -307,8 +350,9 @@ def trace_instances(
 def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions) -> InstancesTraced:
     """Walk one ray over the instances."""
     origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
-    seen = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
-    row = prepared_ray(seen, ray[0], ray[1], ray[2], jnp.int32(0))
+    # Of a `WalkScene` it has what the walk of one ray asks.
+    seen: Any = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
+    row = prepared_rays(seen, ray[0][None], ray[1][None], ray[2][None], options.test)[0]
     none = jnp.int32(MISS)
 
     def nothing(ready: ReadyRay) -> Any:

@@ -136,8 +136,8 @@ def search_of(scene: WalkScene, at: Vector, margin: Array, decode: Decode | None
     return Search(scene, squares_of, visits_of(scene, at, decode))
 
 
-def visits_of(scene: WalkScene, at: Vector, decode: Decode | None) -> Callable[[Array, Any, Any], Nearest]:
-    """The `visit` of a search for the closest triangle."""
+def visits_of(scene: Any, at: Vector, decode: Decode | None) -> Callable[[Array, Any, Any], Nearest]:
+    """The `visit` of a search for the closest triangle, in a scene that has leaves as a `WalkScene` has."""
 
     def visit(child: Array, where: Any, nearest: Nearest) -> Nearest:
         return _visit_leaf(scene, at, child, where, nearest, decode)
@@ -161,7 +161,7 @@ def searched(search: Search, root: Array, there: Array, stack: Array, nearest: A
     )
 
 
-def corners_of(scene: WalkScene, found: Array, nearest: Nearest, decode: Decode | None) -> Array:
+def corners_of(scene: Any, found: Array, nearest: Nearest, decode: Decode | None) -> Array:
     """(9,) float32: corners a, b, c of the closest triangle, scaled, x first; zeros where there is none."""
     leaf = _leaf(scene, scene.find_leaf(jnp.where(found, nearest.leaf, -1)), decode)
     held = jnp.arange(WIDTH, dtype=jnp.int32) == nearest.lane
@@ -213,7 +213,7 @@ def box_squares(boxes: Array, at: Vector, margins: Vector) -> Array:
     return jnp.where(jnp.isnan(boxes[0]), jnp.float32(jnp.nan), total * np.float32(1 - 2.0**-21))
 
 
-def _leaf(scene: WalkScene, where: Any, decode: Decode | None) -> Leaf:
+def _leaf(scene: Any, where: Any, decode: Decode | None) -> Leaf:
     axes = (jnp.uint32(0), jnp.uint32(1), jnp.uint32(2))
     return scene.leaf_of(axes, where, decode)
 
@@ -276,7 +276,7 @@ def _cross(p: Vector, q: Vector) -> Vector:
 
 
 def _visit_leaf(
-    scene: WalkScene, at: Vector, child: Array, where: Any, nearest: Nearest, decode: Decode | None
+    scene: Any, at: Vector, child: Array, where: Any, nearest: Nearest, decode: Decode | None
 ) -> Nearest:
     """The closest triangle with those of a leaf; of equals, that of the least face."""
     leaf = _leaf(scene, where, decode)
