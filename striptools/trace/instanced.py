@@ -20,7 +20,7 @@ from striptools.hierarchies.wide import EMPTY, WideTree
 from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
-from striptools.trace.layout import Found, Layout, PacketView, Rays
+from striptools.trace.layout import Found, Layout, PacketView, Rays, blocks_of
 from striptools.trace.leaves import LeafBlocks, aligned_full, lay_out_wide, scale_for, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
 from striptools.trace.standing import Places
@@ -114,7 +114,7 @@ class InstancedLayout:
         geometries: All geometries, each in its own frame.
         depth: The most nodes on a way from a root down, of instances or of a geometry.
         numbers: What hits are called.
-        first_triangle: (g,) int64, the first triangle in file order of each geometry.
+        first_triangle: (g+1,) int64, the first triangle in file order of each geometry, then all.
         first_face: (g,) int64, its first source face; triangle without a remap.
         mirrored: (k,) bool, which instances turn the winding of faces.
         in_place: Whether rays meet triangles where they stand, and are not moved for them.
@@ -206,6 +206,22 @@ class InstancedLayout:
         order = (np.arange(3) + first[:, None]) % 3
         return np.take_along_axis(corners, order[:, None], axis=2), ((turns + first) % 3).astype(np.int32)
 
+    def names(self) -> np.ndarray:
+        """See `layout.Layout`: of the triangles of geometries, which stand in several places."""
+        return self.geometries.names()
+
+    def corner_blocks(self, most: int) -> Iterator[np.ndarray]:
+        """See `layout.Layout`: placed, instance by instance."""
+        names, numbers = self.names(), self.numbers
+        end = int(numbers.first_triangle[-1] + np.diff(self.first_triangle)[numbers.geometry[-1]])
+        for first in range(0, end, most * WIDTH):
+            triangle = np.arange(first, min(end, first + most * WIDTH))
+            instance = numbers.instance_of(triangle)
+            own = (
+                triangle - numbers.first_triangle[instance] + self.first_triangle[numbers.geometry[instance]]
+            )
+            yield blocks_of(self.corners_of(names[own], instance)[0])
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle of the flattened scene."""
         t, face, u, v, triangle = found
@@ -231,10 +247,8 @@ class InstancedLayout:
         """The same of rays that are not moved, and of triangles where they stand."""
         corners, turns = self.corners_of(names, instance)
         count = len(names)
-        lanes = _padded(corners.reshape(count, 9), -(-count // WIDTH) * WIDTH)
-        blocks = lanes.reshape(-1, WIDTH, 9).transpose(0, 2, 1).copy()
         place = np.arange(count, dtype=np.int32) * 4 + turns
-        held = LeafBlocks(blocks, place, np.zeros(0, np.int32), self.arrays.frame.scale)
+        held = LeafBlocks(blocks_of(corners), place, np.zeros(0, np.int32), self.arrays.frame.scale)
         return _weights_by(held, rays, np.arange(count, dtype=np.int32))
 
     def moved(
@@ -324,8 +338,8 @@ def lay_out_instanced(
         # Planes of packed boxes are counted from the scene's low, whatever the geometry.
         reaches[:] = float(geometries.arrays.frame.reach)
     geometry, size = numbers.geometry, size_class(len(scene.instances))
-    starts = scene.spans.face_starts[:-1].astype(np.int64)
-    first_face = starts if scene.remap is None else scene.geometries.first_face
+    starts = scene.spans.face_starts.astype(np.int64)
+    first_face = starts[:-1] if scene.remap is None else scene.geometries.first_face
     mirrored = scene.instances.placed.mirrored
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     arrays = InstancedScene(

@@ -425,8 +425,7 @@ class Tracer:
             method: "parity" or "winding".
 
         Raises:
-            UsageError: The points are not of this shape, there is no such method, or it is winding and the
-                scene is kept compressed or its instances shared.
+            UsageError: The points are not of this shape, or there is no such method.
             StriptoolsError: As for `closest_hit`.
         """
         if method == "winding":
@@ -439,24 +438,19 @@ class Tracer:
         """The generalised winding number of the mesh at each point, 0 at points that are not finite.
 
         1 inside and 0 outside of a closed mesh whose faces are wound counter-clockwise from outside; in
-        between where there are holes. Each point takes each triangle.
+        between where there are holes. Each point takes each triangle, placed or decoded where it is not kept
+        so: through shared instances within 1e-5 or so of the flattened scene's, whose sums are others.
 
         Args:
             points: (r, 3) in the frame of the scene's positions.
 
         Raises:
-            UsageError: The points are not of this shape, or the scene is kept compressed or its instances
-                shared.
+            UsageError: The points are not of this shape.
         """
         checked = checked_points(points)
         if self._empty:
             return np.zeros(len(checked), np.float32)
-        wide = self._wide_nodes("winding numbers do not")
-        if self._resident == "compressed":
-            raise UsageError(
-                "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
-            )
-        return winding_numbers(wide._layout.arrays, checked)
+        return winding_numbers(self._gatherer()._layout, checked)
 
     def program_parts(self) -> tuple[Any, WalkOptions]:
         """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
