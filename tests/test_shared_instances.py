@@ -372,9 +372,6 @@ def test_what_float32_cannot_move_is_refused():
 
 def test_what_cannot_be_done_is_refused(crowd):
     _, scene = crowd
-    tracer = Tracer(scene, device="cpu", instances="shared")
-    with pytest.raises(UsageError, match="shared instances"):
-        tracer.program_parts()
     with pytest.raises(UsageError, match="no such instances"):
         Tracer(scene, instances="gold")
     with pytest.raises(UsageError, match="flattened instances are expanded"):

@@ -456,32 +456,31 @@ class Tracer:
         """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
 
         Raises:
-            UsageError: There is nothing to trace, or instances are shared.
+            UsageError: There is nothing to trace.
         """
         if self._empty:
             raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
-        wide = self._wide_nodes("functions of arrays do not")
+        wide = self._gatherer()
         options = wide._options()
         assert options is not None
         with quiet_jax():
             return jax.device_put(wide._layout.arrays, self.devices[0]), options
 
     def _gatherer(self) -> "Tracer":
-        """The tracer that gathers hits: this one through shared instances, else that of wide nodes."""
-        return self if self._shared else self._wide_nodes("only closest hits and any hits")
+        """The tracer for more than closest and any hits, of nodes that have each triangle in one leaf.
 
-    def _wide_nodes(self, refused: str) -> "Tracer":
-        """The tracer of wide nodes that have each triangle in one leaf: this one, or one beside it.
+        This one through shared instances and wide nodes, else one of wide nodes beside it.
 
         Raises:
-            UsageError: There is none, naming what is `refused` to go through this layout.
+            UsageError: There is none.
         """
-        self._refuse_shared(refused)
-        if self._empty or self._has_each_once:
+        if self._empty or self._shared or self._has_each_once:
             return self
         if self._rebuild is None:
             raise UsageError(
-                f"{refused} go through this hierarchy", where="hierarchy", remedy="trace a scene under it"
+                "only closest hits and any hits go through this hierarchy",
+                where="hierarchy",
+                remedy="trace a scene under it",
             )
         return self._rebuilt
 
@@ -490,15 +489,6 @@ class Tracer:
         """The same scene under wide nodes that have each triangle in one leaf."""
         assert self._rebuild is not None
         return self._rebuild()
-
-    def _refuse_shared(self, refused: str) -> None:
-        """Refuse what cannot go through shared instances."""
-        if self._shared:
-            raise UsageError(
-                f"{refused} go through shared instances",
-                where="instances",
-                remedy="use instances flattened",
-            )
 
     def _gather(
         self, rays: Rays, kind: GatherKind, most: int

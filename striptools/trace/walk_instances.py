@@ -65,6 +65,7 @@ from striptools.trace.walk import (
     Alone,
     Frame,
     ReadyRay,
+    Traced,
     WalkOptions,
     found_alone,
     largest_of,
@@ -143,6 +144,10 @@ class InstancedScene(NamedTuple):
     def find_leaf(self, child: Array) -> Array:
         """The child."""
         return child
+
+    def faces_of(self, names: Array) -> Array:
+        """Names that `trace_in_place` gives are faces."""
+        return names
 
     def root_of(self, instance: Array) -> Array:
         """The root of an instance's geometry."""
@@ -239,6 +244,7 @@ class _Seen(NamedTuple):
     origin: Array
     direction: Array
     size: Array
+    in_place: bool
 
     @property
     def frame(self) -> Frame:
@@ -279,10 +285,10 @@ class _Seen(NamedTuple):
         # A GPU goes through the motions for rays that are at no leaf.
         there = (where < 0) & (where != DONE)
         limit = jnp.where(there, best.limit, 0)
-        if options.test == "watertight":
-            seen, row = self._moved_into(index(number), limit)
-        else:
+        if self.in_place:
             seen, row = self._standing_at(index(number), limit, shear)
+        else:
+            seen, row = self._moved_into(index(number), limit)
         return best.after(number, seen, walk_alone(seen, row, options), options)
 
     def _moved_into(self, at: Array, limit: Array) -> tuple[Any, Array]:
@@ -329,14 +335,42 @@ def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]
     return turned(origin) + matrix[:, 3], turned(direction)
 
 
-def trace_instances(
+def trace_in_place(
     scene: InstancedScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+) -> Traced:
+    """Trace r rays as through the flattened scene (difference 6): names are faces, of any hits `walk.HIT`."""
+    found = trace_instances(scene, origins, directions, t_max, options, in_place=True)
+    if options.any_hit:
+        return Traced(found.t, found.name, found.counters, found.counted)
+    hit = found.name >= 0
+    own = scene.geometries.faces_of(jnp.where(hit, found.name, 0))
+    face = own + scene.places.faces[jnp.where(hit, found.instance, 0)]
+    return Traced(found.t, jnp.where(hit, face, found.name), found.counters, found.counted)
+
+
+def trace_instances(
+    scene: InstancedScene,
+    origins: Array,
+    directions: Array,
+    t_max: Array,
+    options: WalkOptions,
+    in_place: bool = False,
 ) -> InstancesTraced:
-    """Trace r rays, one by one or all at once; arguments are those of `walk.trace_rays`."""
+    """Trace r rays, one by one or all at once.
+
+    Args:
+        scene: What to trace.
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+        t_max: (r,) float32.
+        options: What to compile in.
+        in_place: Let rays meet triangles where they stand, as tests other than the watertight one have it.
+    """
     options = options._replace(interleave=1)
+    in_place = in_place or options.test != "watertight"
 
     def walk(*ray: Array) -> InstancesTraced:
-        return _walk_ray(scene, ray, options)
+        return _walk_ray(scene, ray, options, in_place)
 
     rays = (origins, directions, t_max)
     if options.batch:
@@ -347,11 +381,13 @@ def trace_instances(
     return found._replace(t=jnp.zeros(0)) if options.any_hit else found
 
 
-def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions) -> InstancesTraced:
+def _walk_ray(
+    scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions, in_place: bool
+) -> InstancesTraced:
     """Walk one ray over the instances."""
     origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
     # Of a `WalkScene` it has what the walk of one ray asks.
-    seen: Any = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
+    seen: Any = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach), in_place)
     row = prepared_rays(seen, ray[0][None], ray[1][None], ray[2][None], options.test)[0]
     none = jnp.int32(MISS)
 
