@@ -129,7 +129,7 @@ def test_threads_and_points_all_at_once_change_nothing(crowd):
     ready = np.concatenate([scaled, np.ones((777, 1))], axis=1, dtype=np.float32)
     for walked in zip(
         *(
-            program(one._mesh, PointOptions(one._stack_size, batch, None), True)(one._scene, ready)
+            program(one._mesh, PointOptions(one._stack_size, batch, None), True)(one._standing, ready)
             for batch in (False, True)
         ),
         strict=True,
@@ -167,7 +167,7 @@ def test_the_walk_is_hoisted(resident):
     tracer, _ = tracers(convert(load(SCENES["mirrored"])), resident)
     options = PointOptions(tracer._stack_size, False, tracer._layout.decode)
     assert_hoisted(
-        program(tracer._mesh, options, True).lower(tracer._scene, np.zeros((256, 4), np.float32)), loops=3
+        program(tracer._mesh, options, True).lower(tracer._standing, np.zeros((256, 4), np.float32)), loops=3
     )
 
 

@@ -186,8 +186,8 @@ def test_boxes_that_are_not_widened_would_lose_hits():
     rays = rays_from_near(scene, 5000)
     tracer, flat = both(scene, "exact-sign")
     arrays = tracer._layout.arrays
-    none = arrays._replace(slips=np.full_like(arrays.slips, -walk_instances.CORNER_SLIPS))
-    tracer._take(replace(tracer._layout, arrays=none))
+    none = arrays.places._replace(slips=np.full_like(arrays.places.slips, -walk_instances.CORNER_SLIPS))
+    tracer._take(replace(tracer._layout, arrays=arrays._replace(places=none)))
     assert (tracer.closest_hit(*rays).face != flat.closest_hit(*rays).face).sum() > 100
 
 

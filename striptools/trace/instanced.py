@@ -1,12 +1,13 @@
 """A scene with instances laid out for the walk: each geometry once, and a hierarchy over where they stand.
 
 What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances`
-says why. Cost beside the geometries: 230 bytes an instance, 40 of the nodes over them, and size classes.
+says why. Cost beside the geometries: 80 bytes an instance, about 40 of the nodes over them, and size classes;
+150 more from when triangles are first asked for where they stand.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from striptools.errors import LimitError, UsageError
 from striptools.hierarchies.rebuilt import rebuild
 from striptools.hierarchies.wide import EMPTY, WideTree
+from striptools.mesh.instances import Instances
 from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
@@ -86,7 +88,6 @@ class Moves:
         matrices: (k, 3, 4) float32, from the scaled scene to the scaled geometry.
         slips: (k,) float64, how far a hit may be from the ray, in units of the largest coordinate of ray
             origin and scene: f of `walk_instances`; infinite where float32 will not do.
-        places: (k, 3, 4) float64, from the scaled geometry to the scaled scene.
         boxes: (k, 6) float64, of the instances, scaled.
         scale: Of the scene, a power of two.
         reach: The largest scaled coordinate of the scene.
@@ -94,7 +95,6 @@ class Moves:
 
     matrices: Float32[np.ndarray, "k 3 4"]
     slips: Float64[np.ndarray, " k"]
-    places: Float64[np.ndarray, "k 3 4"]
     boxes: Float64[np.ndarray, "k 6"]
     scale: np.float32
     reach: float
@@ -116,7 +116,8 @@ class InstancedLayout:
         numbers: What hits are called.
         first_triangle: (g+1,) int64, the first triangle in file order of each geometry, then all.
         first_face: (g,) int64, its first source face; triangle without a remap.
-        mirrored: (k,) bool, which instances turn the winding of faces.
+        instances: As the scene has them.
+        slips: (k,) float32, f of `walk_instances`.
         in_place: Whether rays meet triangles where they stand, and are not moved for them.
     """
 
@@ -126,8 +127,30 @@ class InstancedLayout:
     numbers: InstanceNumbers
     first_triangle: np.ndarray
     first_face: np.ndarray
-    mirrored: np.ndarray
+    instances: Instances
+    slips: np.ndarray
     in_place: bool = False
+
+    @cached_property
+    def mirrored(self) -> Bool[np.ndarray, " k"]:
+        """(k,) bool, which instances turn the winding of faces."""
+        return self.instances.mirrored
+
+    @cached_property
+    def places(self) -> Places:
+        """What triangles are placed by where they are asked for where they stand; counted from then on."""
+        if self.arrays.places is not None:
+            return self.arrays.places
+        size, numbers, scale = len(self.arrays.roots), self.numbers, float(self.arrays.frame.scale)
+        matrix = self.instances.matrix * scale
+        matrix[:, :, :3] /= float(self.geometries.arrays.frame.scale)
+        return Places(
+            _padded(matrix.view(np.int32).reshape(-1, 3, 4, 2), size),
+            _padded(self.mirrored, size),
+            _padded((numbers.first_face - self.first_face[numbers.geometry]).astype(np.int32), size),
+            _padded(self.slips, size),
+            _padded(stretch_bounds(matrix), size),
+        )
 
     @property
     def decode(self) -> Decode | None:
@@ -155,8 +178,8 @@ class InstancedLayout:
         """Bytes of all arrays."""
         arrays = self.arrays
         above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches, self.numbers.geometry)
-        above = (*above, *arrays.places, arrays.slips, arrays.bounds)
-        above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
+        above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.slips)
+        above = (*above, *(arrays.places or self.__dict__.get("places") or ()))
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
     @property
@@ -194,7 +217,7 @@ class InstancedLayout:
         """See `layout.Layout`; corners where they stand, as `standing` places them."""
         assert instance is not None
         own, turns = self.geometries.corners_of(names)
-        matrix = self.arrays.places.matrices.view(np.float64)[instance, :, :, 0, None]
+        matrix = self.places.matrices.view(np.float64)[instance, :, :, 0, None]
         x, y, z = (own[:, None, axis].astype(np.float64) for axis in range(3))
         placed = ((matrix[:, :, 0] * x + matrix[:, :, 1] * y) + matrix[:, :, 2] * z) + matrix[:, :, 3]
         corners = placed.astype(np.float32)
@@ -340,7 +363,6 @@ def lay_out_instanced(
     geometry, size = numbers.geometry, size_class(len(scene.instances))
     starts = scene.spans.face_starts.astype(np.int64)
     first_face = starts[:-1] if scene.remap is None else scene.geometries.first_face
-    mirrored = scene.instances.placed.mirrored
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     arrays = InstancedScene(
         nodes,
@@ -349,24 +371,19 @@ def lay_out_instanced(
         _padded(reaches[geometry].astype(np.float32), size),
         Frame(moves.scale, np.float32(moves.reach), zero, one, MARGIN),
         geometries.arrays,
-        Places(
-            _padded(moves.places.view(np.int32).reshape(-1, 3, 4, 2), size),
-            _padded(mirrored, size),
-            _padded((numbers.first_face - first_face[geometry]).astype(np.int32), size),
-        ),
-        _padded((moves.slips * (1 + 2 * U)).astype(np.float32), size),
-        _padded(stretch_bounds(moves.places), size),
     )
-    return InstancedLayout(
+    layout = InstancedLayout(
         arrays,
         geometries,
         max(wide.depth, geometries.depth),
         numbers,
         starts,
         first_face,
-        mirrored,
+        scene.instances.placed,
+        (moves.slips * (1 + 2 * U)).astype(np.float32),
         in_place,
     )
+    return replace(layout, arrays=arrays._replace(places=layout.places)) if in_place else layout
 
 
 def geometry_boxes(scene: "Scene") -> Float64[np.ndarray, "g 6"]:
@@ -395,7 +412,7 @@ def moves_of(scene: "Scene", geometry_boxes: Float64[np.ndarray, "g 6"]) -> Move
         extent = np.abs(geometry_boxes).max(axis=1)[geometry] * inner
         slips = _slips(a, b, matrices.astype(np.float64), extent, reach)
     slips[~np.isfinite(matrices).all(axis=(1, 2))] = np.inf
-    return Moves(matrices, slips, np.concatenate([a, b[:, :, None]], axis=2), boxes, scale, reach)
+    return Moves(matrices, slips, boxes, scale, reach)
 
 
 def _inverted(a: np.ndarray) -> np.ndarray:

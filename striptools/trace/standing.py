@@ -32,11 +32,15 @@ class Places(NamedTuple):
         matrices: (k, 3, 4, 2) int32, the bits of float64: from the scaled geometry to the scaled scene.
         mirrored: (k,) bool, which exchange the second and third corners of their triangles.
         faces: (k,) int32, what is added to a geometry's face to give that of the flattened source.
+        slips: (k,) float32, f of `walk_instances`.
+        bounds: (k, 3, 4) float32, three axes V of each geometry and stretches w (`walk_points_instances`).
     """
 
     matrices: Any
     mirrored: Any
     faces: Any
+    slips: Any
+    bounds: Any
 
 
 class Standing(NamedTuple):
@@ -154,7 +158,7 @@ def standing(geometries: Any, places: Places, instance: Array) -> Standing:
     def taken(values: Array) -> Array:
         return lax.dynamic_index_in_dim(values, index(instance), keepdims=False)
 
-    return Standing(geometries, *(taken(values) for values in places))
+    return Standing(geometries, taken(places.matrices), taken(places.mirrored), taken(places.faces))
 
 
 def _placed_along(row: Array, point: list[Array]) -> Array:

@@ -217,8 +217,17 @@ class Tracer:
 
     def _take(self, layout: Layout) -> None:
         self._layout: Layout = layout
-        self._scene = replicate(layout.arrays, self._mesh)
+        self._scene: Any = replicate(layout.arrays, self._mesh)
+        self.__dict__.pop("_standing", None)
         self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
+
+    @cached_property
+    def _standing(self) -> Any:
+        """The scene on the devices; of shared instances where they stand, too."""
+        if not isinstance(self._layout, InstancedLayout):
+            return self._scene
+        places: Any = self._layout.places
+        return self._scene._replace(places=replicate(places, self._mesh))
 
     @property
     def devices(self) -> list[Any]:
@@ -405,7 +414,7 @@ class Tracer:
         else:
             wide = self._gatherer()
             options = PointOptions(wide._stack_size, wide._on_gpu, wide._layout.decode)
-            found = closest_points(wide._scene, wide._layout, checked, wide._mesh, options)
+            found = closest_points(wide._standing, wide._layout, checked, wide._mesh, options)
         if signed:
             inside = self.contains(checked)
             found.distance[inside] *= -1
@@ -464,7 +473,10 @@ class Tracer:
         options = wide._options()
         assert options is not None
         with quiet_jax():
-            return jax.device_put(wide._layout.arrays, self.devices[0]), options
+            layout, arrays = wide._layout, wide._layout.arrays
+            if isinstance(layout, InstancedLayout):
+                arrays = arrays._replace(places=layout.places)
+            return jax.device_put(arrays, self.devices[0]), options
 
     def _gatherer(self) -> "Tracer":
         """The tracer for more than closest and any hits, of nodes that have each triangle in one leaf.

@@ -102,9 +102,7 @@ class InstancedScene(NamedTuple):
         reaches: (k,) float32, the largest scaled coordinate of its geometry.
         frame: How rays are seen from the scene.
         geometries: All geometries, in their own frames.
-        places: Where instances stand.
-        slips: (k,) float32, f of each instance.
-        bounds: (k, 3, 4) float32, three axes V of each geometry and stretches w (`walk_points_instances`).
+        places: Where instances stand; None where only moved rays are asked for.
     """
 
     nodes: Any
@@ -113,9 +111,7 @@ class InstancedScene(NamedTuple):
     reaches: Any
     frame: Frame
     geometries: Any
-    places: Places
-    slips: Any
-    bounds: Any
+    places: Places | None = None
 
     @property
     def node_count(self) -> int:
@@ -155,6 +151,7 @@ class InstancedScene(NamedTuple):
 
     def standing(self, instance: Array) -> Standing:
         """An instance where it stands."""
+        assert self.places is not None
         return standing(self.geometries, self.places, instance)
 
     def visited(self, top: Array, below: Array) -> Array:
@@ -304,7 +301,8 @@ class _Seen(NamedTuple):
         scene, matrix = self.scene, row_of(self.scene.matrices, at)
         origin, direction = moved(matrix, self.origin, self.direction)
         own = scene.geometries.frame
-        slip = (value_at(scene.slips, at) + CORNER_SLIPS) * self.size
+        assert scene.places is not None
+        slip = (value_at(scene.places.slips, at) + CORNER_SLIPS) * self.size
         wider = jnp.abs(matrix[:, :3]).sum(axis=1).max() * slip * np.float32(1 + 2.0**-18)
         reach = larger(largest_of(origin), value_at(scene.reaches, at)) + wider / own.margin
         seen = scene.geometries._replace(frame=own._replace(scale=jnp.float32(1), reach=reach))
@@ -343,6 +341,7 @@ def trace_in_place(
     if options.any_hit:
         return Traced(found.t, found.name, found.counters, found.counted)
     hit = found.name >= 0
+    assert scene.places is not None
     own = scene.geometries.faces_of(jnp.where(hit, found.name, 0))
     face = own + scene.places.faces[jnp.where(hit, found.instance, 0)]
     return Traced(found.t, jnp.where(hit, face, found.name), found.counters, found.counted)

@@ -106,7 +106,8 @@ def _search_inside(
 ) -> Search:
     """The search in one instance: boxes as its geometry has them, stretched, triangles where they stand."""
     at, geometries = index(number), scene.geometries
-    stands, bounds = scene.standing(number), row_of(scene.bounds, at)
+    assert scene.places is not None
+    stands, bounds = scene.standing(number), row_of(scene.places.bounds, at)
     seen, off = _moved(stands, row_of(scene.matrices, at), point[:3])
     axes, stretch = bounds[:, :3], bounds[:, 3]
     size = _turned(jnp.abs(axes), larger(jnp.abs(seen), value_at(scene.reaches, at)))
