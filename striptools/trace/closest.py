@@ -80,14 +80,14 @@ def _weigh(
     closest: tuple[np.ndarray, ...],
     found: ClosestPoints,
 ) -> None:
-    """Say where on their triangles the closest points are: names, corners, and instances if there are any."""
+    """Say where on their triangles the closest points are: of names, and instances if there are any."""
     met = np.flatnonzero(closest[0] >= 0)
     at = met + part.start
-    names, corners, *instance = (column[met] for column in closest)
-    triangles = corners.astype(np.float64).reshape(-1, 3, 3).swapaxes(1, 2)
-    triangles /= float(layout.arrays.frame.scale)
-    face, triangle, turn = layout.named(names, *instance)
-    # Corner j as the walk has it is the face's corner (j + turn) % 3; of two as close its first is taken.
+    named = [column[met] for column in closest]
+    face, triangle, _ = layout.named(*named)
+    corners, turn = layout.corners_of(*named)
+    triangles = corners.astype(np.float64).swapaxes(1, 2) / float(layout.arrays.frame.scale)
+    # Corner j as the tests have it is the face's corner (j + turn) % 3; of two as close its first is taken.
     of_face = (np.arange(3) - turn[:, None]) % 3
     triangles = np.take_along_axis(triangles, of_face[..., None], axis=1)
     weights = closest_weights(triangles, points[at].astype(np.float64))

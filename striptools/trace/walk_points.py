@@ -28,22 +28,23 @@ from jax import Array, lax
 
 from striptools.trace.numerics import folded, index, larger, rounded, smaller
 from striptools.trace.triangle import pick
-from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, WIDTH, Decode, Frame, Leaf, WalkScene
+from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, Decode, Frame, Leaf, WalkScene
 
 FARTHEST = np.float32(2.0**60)
 """The largest scaled coordinate of a point that can be looked from: squares stay finite."""
+
+LANE_BITS = np.int32(15)
+"""The bits of a square that say a lane when the nearest is chosen: the order of visits needs no more."""
 
 Vector = tuple[Array, Array, Array]
 
 
 class Nearest(NamedTuple):
-    """The closest triangle so far: the square of its distance, its name, its leaf and its lane there."""
+    """The closest triangle so far: the square of its distance, its name and its face."""
 
     square: Array
     name: Array
     face: Array
-    leaf: Array
-    lane: Array
 
 
 class Searched(NamedTuple):
@@ -63,13 +64,13 @@ class Search:
         scene: Whose nodes they are: of `WalkScene` `width`, `node_count`, `child_of` and `find_leaf`.
         squares_of: From a node, the squares of the distances of its children, (width,) float32, at most the
             true ones; not a number in empty lanes.
-        visit: From a leaf as a node names it, what `find_leaf` says of it, and the closest so far, which has
-            a `square`, the closest after it.
+        visit: From what `find_leaf` says of a leaf and the closest so far, which has a `square`, the closest
+            after it.
     """
 
     scene: Any
     squares_of: Callable[[Array], Array]
-    visit: Callable[[Array, Any, Any], Any]
+    visit: Callable[[Any, Any], Any]
 
 
 class PointOptions(NamedTuple):
@@ -81,10 +82,9 @@ class PointOptions(NamedTuple):
 
 
 class Closest(NamedTuple):
-    """One entry a point: what the scene calls the triangle, and its corners a, b, c (9,), scaled, x first."""
+    """One entry a point: what the scene calls the triangle, `walk.MISS` or `walk.STUCK`."""
 
     name: Array
-    corners: Array
 
 
 def closest_triangles(scene: Any, points: Array, options: PointOptions, walk_one: Any = None) -> Any:
@@ -113,7 +113,7 @@ def walk_point(scene: WalkScene, point: Array, stack: Array, options: PointOptio
     search = search_of(scene, at, margin_of(scene.frame, at), options.decode)
     end = searched(search, jnp.int32(0), point[3] > 0, stack, nothing_near())
     name = jnp.where(end.height > 0, STUCK, end.nearest.name)
-    return end.stack, Closest(name, corners_of(scene, name >= 0, end.nearest, options.decode))
+    return end.stack, Closest(name)
 
 
 def margin_of(frame: Frame, at: Vector) -> Array:
@@ -124,7 +124,7 @@ def margin_of(frame: Frame, at: Vector) -> Array:
 
 def nothing_near() -> Nearest:
     """What is closest before anything is looked at."""
-    return Nearest(*(jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME, DONE, np.int32(0))))
+    return Nearest(*(jnp.asarray(value) for value in (np.float32(np.inf), MISS, NO_NAME)))
 
 
 def search_of(scene: WalkScene, at: Vector, margin: Array, decode: Decode | None) -> Search:
@@ -136,11 +136,11 @@ def search_of(scene: WalkScene, at: Vector, margin: Array, decode: Decode | None
     return Search(scene, squares_of, visits_of(scene, at, decode))
 
 
-def visits_of(scene: Any, at: Vector, decode: Decode | None) -> Callable[[Array, Any, Any], Nearest]:
+def visits_of(scene: Any, at: Vector, decode: Decode | None) -> Callable[[Any, Nearest], Nearest]:
     """The `visit` of a search for the closest triangle, in a scene that has leaves as a `WalkScene` has."""
 
-    def visit(child: Array, where: Any, nearest: Nearest) -> Nearest:
-        return _visit_leaf(scene, at, child, where, nearest, decode)
+    def visit(where: Any, nearest: Nearest) -> Nearest:
+        return _visit_leaf(scene, at, where, nearest, decode)
 
     return visit
 
@@ -161,27 +161,20 @@ def searched(search: Search, root: Array, there: Array, stack: Array, nearest: A
     )
 
 
-def corners_of(scene: Any, found: Array, nearest: Nearest, decode: Decode | None) -> Array:
-    """(9,) float32: corners a, b, c of the closest triangle, scaled, x first; zeros where there is none."""
-    leaf = _leaf(scene, scene.find_leaf(jnp.where(found, nearest.leaf, -1)), decode)
-    held = jnp.arange(WIDTH, dtype=jnp.int32) == nearest.lane
-    axes = (leaf.x, leaf.y, leaf.z)
-    return jnp.stack([jnp.where(held & found, lanes, 0).sum() for axis in axes for lanes in axis])
-
-
 def _turn(search: Search, state: Searched) -> Searched:
     """Visit the nearest lane left of the node on top, or leave the node."""
     scene = search.scene
     top = index(state.height - 1)
     node, lanes = lax.dynamic_slice(state.stack, (top, jnp.uint32(0)), (1, 2))[0]
-    squares = search.squares_of(node)
-    order = jnp.arange(scene.width, dtype=jnp.int32)
-    left = (lanes >> order & 1 != 0) & (squares <= state.nearest.square)
-    squares = jnp.where(left, squares, jnp.float32(jnp.inf))
-    least = folded(squares, smaller)
-    lane = folded(jnp.where(left & (squares == least), order, jnp.int32(scene.width)), smaller)
-    some = lane < scene.width
-    lane = jnp.where(some, lane, 0)
+    # Behind a cond, whose result is there once: a lane that is computed anew for each of its uses, fused in
+    # another way, may be another one, and a child be left out. It is always so, which XLA does not know.
+    chosen = lax.cond(
+        node >= 0,
+        lambda: _nearest_lane(search, node, lanes, state.nearest.square),
+        lambda: jnp.int32(NO_NAME),
+    )
+    some = chosen != NO_NAME
+    lane = jnp.where(some, chosen & LANE_BITS, 0)
     child = jnp.where(some, scene.child_of(node, index(lane)), DONE)
     rest = jnp.stack([node, lanes ^ jnp.where(some, jnp.int32(1) << lane, 0)])
     stack = lax.dynamic_update_slice(state.stack, rest[None], (top, jnp.uint32(0)))
@@ -192,8 +185,17 @@ def _turn(search: Search, state: Searched) -> Searched:
     stack = lax.dynamic_update_slice(stack, below[None], (above, jnp.uint32(0)))
     at_leaf = (child < 0) & (child != DONE)
     where = scene.find_leaf(child)
-    nearest = lax.cond(at_leaf, lambda: search.visit(child, where, state.nearest), lambda: state.nearest)
+    nearest = lax.cond(at_leaf, lambda: search.visit(where, state.nearest), lambda: state.nearest)
     return Searched(stack, height, state.turns + 1, nearest)
+
+
+def _nearest_lane(search: Search, node: Array, lanes: Array, nearest: Array) -> Array:
+    """() int32: of the lanes left the nearest, below bits of its square's; `NO_NAME` where none is near."""
+    squares = lax.optimization_barrier(search.squares_of(node))
+    order = jnp.arange(search.scene.width, dtype=jnp.int32)
+    left = (lanes >> order & 1 != 0) & (squares <= nearest)
+    bits = lax.bitcast_convert_type(squares, jnp.int32) & ~LANE_BITS | order
+    return folded(jnp.where(left, bits, NO_NAME), smaller)
 
 
 def box_squares(boxes: Array, at: Vector, margins: Vector) -> Array:
@@ -275,9 +277,7 @@ def _cross(p: Vector, q: Vector) -> Vector:
     )
 
 
-def _visit_leaf(
-    scene: Any, at: Vector, child: Array, where: Any, nearest: Nearest, decode: Decode | None
-) -> Nearest:
+def _visit_leaf(scene: Any, at: Vector, where: Any, nearest: Nearest, decode: Decode | None) -> Nearest:
     """The closest triangle with those of a leaf; of equals, that of the least face."""
     leaf = _leaf(scene, where, decode)
     a, b, c = _corners_from(leaf, at)
@@ -287,15 +287,23 @@ def _visit_leaf(
     squares = lax.optimization_barrier(squares)
     within = squares <= nearest.square
     squares = jnp.where(within, squares, jnp.float32(jnp.inf))
-    least = folded(squares, smaller)
-    faces = scene.faces_of(leaf.name)
-    face = folded(jnp.where(within & (squares == least), faces, NO_NAME), smaller)
-    lane = folded(
-        jnp.where(within & (squares == least) & (faces == face), jnp.arange(WIDTH, dtype=jnp.int32), WIDTH),
-        smaller,
-    )
-    closer = (lane < WIDTH) & ((least < nearest.square) | (face < nearest.face))
-    held = jnp.arange(WIDTH, dtype=jnp.int32) == lane
-    name = folded(jnp.where(held, leaf.name, NO_NAME), smaller)
-    new = Nearest(least, name, face, child, lane)
+    faces = jnp.where(within, scene.faces_of(leaf.name), NO_NAME)
+    new = _first_of(squares, leaf.name, faces)
+    closer = (new.square < nearest.square) | ((new.square == nearest.square) & (new.face < nearest.face))
     return Nearest(*(jnp.where(closer, mine, old) for mine, old in zip(new, nearest, strict=True)))
+
+
+def _first_of(squares: Array, names: Array, faces: Array) -> Nearest:
+    """The closest of eight triangles, of equals that of the least face: pairwise, all three numbers at once.
+
+    No lane is looked for by a comparison with the least square, of which the square computed anew may differ.
+    """
+    while len(squares) > 1:
+        half = len(squares) // 2
+        before = (squares[:half] < squares[half:]) | (
+            (squares[:half] == squares[half:]) & (faces[:half] < faces[half:])
+        )
+        squares, names, faces = (
+            jnp.where(before, values[:half], values[half:]) for values in (squares, names, faces)
+        )
+    return Nearest(squares[0], names[0], faces[0])

@@ -3,7 +3,7 @@
 The walk of `walk_points` goes through the hierarchy over instances, whose leaves are instances; in each it
 goes on from the geometry's root, with a stack of its own and with the closest triangle so far. Distances are
 those to triangles where they stand (`standing`), in the flattened scene's order of corners and of faces: the
-triangle found is the one that is found in the flattened scene, its corners are the same bit for bit.
+triangle found is the one that is found in the flattened scene.
 
 **Boxes.** The boxes of a geometry's nodes are looked at from the point as it is moved into its frame. With A
 and b what places the geometry, p the point and P the one it is moved to, r = A P + b - p is computed in
@@ -23,7 +23,7 @@ scene, for boxes over instances and for corners, u s each, and for distances to 
 margin of the geometry's own coordinates for turning boxes and point.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +38,6 @@ from striptools.trace.walk_points import (
     PointOptions,
     Search,
     box_squares,
-    corners_of,
     nothing_near,
     searched,
     visits_of,
@@ -49,10 +48,9 @@ WIDER = np.float32(2)
 
 
 class ClosestInstance(NamedTuple):
-    """One entry a point: see `walk_points.Closest`, corners where they stand; and the instance."""
+    """One entry a point: see `walk_points.Closest`; and the instance, any where there is none."""
 
     name: Array
-    corners: Array
     instance: Array
 
 
@@ -81,7 +79,7 @@ def walk_point(
     def squares_of(node: Array) -> Array:
         return box_squares(scene.boxes_of(node), at, (margin, margin, margin))
 
-    def visit(child: Array, where: Any, nearest: _Nearest) -> _Nearest:
+    def visit(where: Array, nearest: _Nearest) -> _Nearest:
         there = (where < 0) & (where != DONE)
         number = jnp.where(there, -(where + 1), 0)
         inside = _search_inside(scene, number, point, margin, options)
@@ -95,10 +93,7 @@ def walk_point(
     end = searched(Search(scene, squares_of, visit), jnp.int32(0), point[3] > 0, stack, nothing)
     near, instance, stuck = end.nearest
     name = jnp.where((end.height > 0) | stuck, STUCK, near.name)
-    found = name >= 0
-    stands = scene.standing(jnp.where(found, instance, 0))
-    corners = corners_of(stands, found, near, options.decode)
-    return end.stack, ClosestInstance(name, corners, jnp.where(found, instance, MISS))
+    return end.stack, ClosestInstance(name, instance)
 
 
 def _search_inside(
