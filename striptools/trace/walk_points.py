@@ -311,7 +311,7 @@ def _first_of(squares: Array, names: Array, faces: Array) -> Nearest:
 
 # Notes
 #
-# The nearest lane is chosen behind a cond, and comes out of it as one number. Before, a lane was looked for by
-# a comparison with the least square: where squares had more to be fused, those of packed boxes among instances,
-# 5 % of the points ended at another triangle than the closest, compiled, and none uncompiled or under vmap. It
-# is also 0.45 of the time, expanded.
+# The nearest lane is chosen behind a cond, and comes out of it as one number. Before, a lane was looked for
+# by a comparison with the least square: where squares had more to be fused, those of packed boxes among
+# instances, 5 % of the points ended at another triangle than the closest, compiled, and none uncompiled or
+# under vmap. It is also 0.45 of the time, expanded.

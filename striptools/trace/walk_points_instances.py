@@ -146,7 +146,7 @@ def _turned(rows: Array, vectors: Array) -> Array:
 #
 # 40 chandeliers, 10,000 points all over the scene and as many near a surface, one thread; time over that of
 # the flattened scene: turned and evenly scaled 2.2 and 2.0, compressed 2.3 and 1.9; sheared, and stretched
-# unevenly by up to 100, 1.3 and 1.8, compressed 1.7 and 2.2. Lost, in time over what stands here: boxes along
-# the axes of the scene round each turned box, 2 to 3, by visits. Any factor by which far boxes are taken to be
-# nearer than they are has a small instance searched whole, so own axes are for matrices that are upright to
-# 2^-12: with own axes up to l of 1/4, 30 times as long on the sheared ones.
+# unevenly by up to 100, 1.3 and 1.8, compressed 1.7 and 2.2. Lost, in time over what stands here: boxes
+# along the axes of the scene round each turned box, 2 to 3, by visits. Any factor by which far boxes are
+# taken to be nearer than they are has a small instance searched whole, so own axes are for matrices that
+# are upright to 2^-12: with own axes up to l of 1/4, 30 times as long on the sheared ones.
