@@ -372,17 +372,6 @@ def test_what_float32_cannot_move_is_refused():
 
 def test_what_cannot_be_done_is_refused(crowd):
     _, scene = crowd
-    tracer = Tracer(scene, device="cpu", instances="shared")
-    rays = rays_through(scene, 2)
-    for call in (
-        lambda: tracer.contains(rays[0], method="winding"),
-        lambda: tracer.closest_point(rays[0]),
-        lambda: Tracer(scene, device="cpu", instances="shared", test="exact-sign"),
-        lambda: tracer.winding_numbers(rays[0]),
-        lambda: tracer.program_parts(),
-    ):
-        with pytest.raises(UsageError, match="shared instances"):
-            call()
     with pytest.raises(UsageError, match="no such instances"):
         Tracer(scene, instances="gold")
     with pytest.raises(UsageError, match="flattened instances are expanded"):

@@ -10,19 +10,24 @@ from jaxtyping import Float32
 
 from striptools.trace.gathering import check_ended
 from striptools.trace.hit import ClosestPoints
+from striptools.trace.instanced import InstancedLayout
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, TILES, stream_through
 from striptools.trace.layout import Layout
 from striptools.trace.walk import MISS
 from striptools.trace.walk_points import FARTHEST, PointOptions, closest_triangles
+from striptools.trace.walk_points_instances import walk_point as walk_point_among_instances
 
 POINTS_AT_ONCE = 1 << 16
 
 
 @lru_cache(maxsize=16)
-def program(mesh: Mesh, options: PointOptions) -> Any:
-    """The jitted function from a scene and points to `walk_points.Closest`, the points over the devices."""
+def program(mesh: Mesh, options: PointOptions, shared: bool = False) -> Any:
+    """The jitted function from a scene and points to `walk_points.Closest`, the points over the devices.
+
+    To `walk_points_instances.ClosestInstance` where geometries are shared by instances.
+    """
     split = jax.shard_map(
-        partial(closest_triangles, options=options),
+        partial(closest_triangles, options=options, walk_one=walk_point_among_instances if shared else None),
         mesh=mesh,
         in_specs=(EVERYWHERE, RAYS),
         out_specs=RAYS,
@@ -58,12 +63,13 @@ def closest_points(
         known = np.abs(scaled).max(axis=1, initial=0) <= FARTHEST
     ready = np.concatenate([np.where(known[:, None], scaled, 0), known[:, None]], axis=1, dtype=np.float32)
     sizes = GPU_TILES if options.batch else TILES
-    for part, traced in stream_through(program(mesh, options), scene, (ready,), mesh, sizes):
+    shared = isinstance(layout, InstancedLayout)
+    for part, traced in stream_through(program(mesh, options, shared), scene, (ready,), mesh, sizes):
         check_ended(traced[0])
         for first in range(0, part.stop - part.start, POINTS_AT_ONCE):
             chosen = slice(first, min(first + POINTS_AT_ONCE, part.stop - part.start))
             there = slice(part.start + chosen.start, part.start + chosen.stop)
-            _weigh(layout, points, there, traced[0][chosen], traced[1][chosen], found)
+            _weigh(layout, points, there, tuple(column[chosen] for column in traced), found)
     return found
 
 
@@ -71,17 +77,17 @@ def _weigh(
     layout: Layout,
     points: np.ndarray,
     part: slice,
-    names: np.ndarray,
-    corners: np.ndarray,
+    closest: tuple[np.ndarray, ...],
     found: ClosestPoints,
 ) -> None:
-    """Say where on their triangles the closest points are."""
-    met = np.flatnonzero(names >= 0)
+    """Say where on their triangles the closest points are: of names, and instances if there are any."""
+    met = np.flatnonzero(closest[0] >= 0)
     at = met + part.start
-    triangles = corners[met].astype(np.float64).reshape(-1, 3, 3).swapaxes(1, 2)
-    triangles /= float(layout.arrays.frame.scale)
-    face, triangle, turn = layout.named(names[met])
-    # Corner j as the walk has it is the face's corner (j + turn) % 3; of two as close its first is taken.
+    named = [column[met] for column in closest]
+    face, triangle, _ = layout.named(*named)
+    corners, turn = layout.corners_of(*named)
+    triangles = corners.astype(np.float64).swapaxes(1, 2) / float(layout.arrays.frame.scale)
+    # Corner j as the tests have it is the face's corner (j + turn) % 3; of two as close its first is taken.
     of_face = (np.arange(3) - turn[:, None]) % 3
     triangles = np.take_along_axis(triangles, of_face[..., None], axis=1)
     weights = closest_weights(triangles, points[at].astype(np.float64))

@@ -18,6 +18,10 @@ of the face reported. Any order, forwards and backwards.
 Values come from the scene; `positions` only say where the corners are whose derivative is asked for, so they
 have to be those that the scene was made of: after a step that moves vertices, make a new tracer.
 
+Where a scene has instances, faces and positions are those of the flattened mesh, and all values are the bits
+of the flattened scene: a tracer that shares geometries does so here too, but rays meet triangles where they
+stand (`walk_instances`, difference 6).
+
 Under vmap the rays of all elements are walked as one batch: the loop stays one native function, which it
 would not where vmap turned the loop itself into one over batches. Inside a program of yours a walk runs on
 one device; the tracer itself uses all.
@@ -39,6 +43,7 @@ from striptools.trace.numerics import power_of_two_below
 from striptools.trace.tracer import Tracer
 from striptools.trace.triangle import Corners, edges_of, pick, shear_of
 from striptools.trace.walk import MISS, STUCK, Traced, WalkOptions, WalkScene, trace_rays
+from striptools.trace.walk_instances import InstancedScene, trace_in_place
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("scene", "faces"), meta_fields=("options",))
@@ -62,7 +67,8 @@ class Geometry:
 
         Args:
             tracer: Of a scene that was made of a mesh with these faces.
-            faces: (f, 3) of that mesh, as its hits number them: without a remap those of the scene.
+            faces: (f, 3) of that mesh, as its hits number them: without a remap those of the scene. Of a mesh
+                with instances those of `Mesh.flattened`, whether the tracer shares or flattens them.
 
         Raises:
             UsageError: The faces are not of this shape, or the scene has no triangle.
@@ -173,8 +179,14 @@ def _walked(walker: _Walker, origins: Array, directions: Array, reach: Array) ->
     return Traced(*(a.reshape(*shape, *a.shape[1:]) if a.size else a for a in traced))
 
 
+def _traced(scene: Any, origins: Array, directions: Array, reach: Array, options: WalkOptions) -> Traced:
+    if isinstance(scene, InstancedScene):
+        return trace_in_place(scene, origins, directions, reach, options)
+    return trace_rays(scene, origins, directions, reach, options)
+
+
 # Outside of a program of the user's, one that is compiled once.
-_trace = jax.jit(trace_rays, static_argnames="options")
+_trace = jax.jit(_traced, static_argnames="options")
 
 
 @custom_batching.custom_vmap

@@ -1,12 +1,13 @@
 """A scene with instances laid out for the walk: each geometry once, and a hierarchy over where they stand.
 
 What rays are moved by, and how far that puts them off, is computed here in float64; `walk_instances`
-says why. Cost beside the geometries: 80 bytes an instance, about 40 of the nodes over them, and size classes.
+says why. Cost beside the geometries: 80 bytes an instance, about 40 of the nodes over them, and size classes;
+150 more from when triangles are first asked for where they stand.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,12 +18,14 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from striptools.errors import LimitError, UsageError
 from striptools.hierarchies.rebuilt import rebuild
 from striptools.hierarchies.wide import EMPTY, WideTree
+from striptools.mesh.instances import Instances
 from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
 from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
-from striptools.trace.layout import Found, Layout, PacketView, Rays
-from striptools.trace.leaves import aligned_full, lay_out_wide, scale_for, scale_of, size_class
+from striptools.trace.layout import Found, Layout, PacketView, Rays, blocks_of
+from striptools.trace.leaves import LeafBlocks, aligned_full, lay_out_wide, scale_for, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
+from striptools.trace.standing import Places
 from striptools.trace.walk import DONE, WIDTH, Decode, Frame, WalkOptions
 from striptools.trace.walk_instances import InstancedScene, trace_instances
 
@@ -31,6 +34,9 @@ if TYPE_CHECKING:
 
 MOST_SLIP = 0.25
 """The most of gamma_3 k + n for which rays are moved in float32: an instance more sheared is refused."""
+
+UPRIGHT = 1 - 2.0**-12
+"""The least l of `walk_points_instances` for which a geometry's boxes are looked at along its own axes."""
 
 OTHER_SLIPS = 4 * U
 """Roundings of an instance's box."""
@@ -108,9 +114,11 @@ class InstancedLayout:
         geometries: All geometries, each in its own frame.
         depth: The most nodes on a way from a root down, of instances or of a geometry.
         numbers: What hits are called.
-        first_triangle: (g,) int64, the first triangle in file order of each geometry.
+        first_triangle: (g+1,) int64, the first triangle in file order of each geometry, then all.
         first_face: (g,) int64, its first source face; triangle without a remap.
-        mirrored: (k,) bool, which instances turn the winding of faces.
+        instances: As the scene has them.
+        slips: (k,) float32, f of `walk_instances`.
+        in_place: Whether rays meet triangles where they stand, and are not moved for them.
     """
 
     arrays: InstancedScene
@@ -119,7 +127,30 @@ class InstancedLayout:
     numbers: InstanceNumbers
     first_triangle: np.ndarray
     first_face: np.ndarray
-    mirrored: np.ndarray
+    instances: Instances
+    slips: np.ndarray
+    in_place: bool = False
+
+    @cached_property
+    def mirrored(self) -> Bool[np.ndarray, " k"]:
+        """(k,) bool, which instances turn the winding of faces."""
+        return self.instances.mirrored
+
+    @cached_property
+    def places(self) -> Places:
+        """What triangles are placed by where they are asked for where they stand; counted from then on."""
+        if self.arrays.places is not None:
+            return self.arrays.places
+        size, numbers, scale = len(self.arrays.roots), self.numbers, float(self.arrays.frame.scale)
+        matrix = self.instances.matrix * scale
+        matrix[:, :, :3] /= float(self.geometries.arrays.frame.scale)
+        return Places(
+            _padded(matrix.view(np.int32).reshape(-1, 3, 4, 2), size),
+            _padded(self.mirrored, size),
+            _padded((numbers.first_face - self.first_face[numbers.geometry]).astype(np.int32), size),
+            _padded(self.slips, size),
+            _padded(stretch_bounds(matrix), size),
+        )
 
     @property
     def decode(self) -> Decode | None:
@@ -147,7 +178,8 @@ class InstancedLayout:
         """Bytes of all arrays."""
         arrays = self.arrays
         above = (arrays.nodes, arrays.matrices, arrays.roots, arrays.reaches, self.numbers.geometry)
-        above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.mirrored)
+        above = (*above, self.numbers.first_triangle, self.numbers.first_face, self.slips)
+        above = (*above, *(arrays.places or self.__dict__.get("places") or ()))
         return sum(a.nbytes for a in above) + self.geometries.nbytes
 
     @property
@@ -155,17 +187,23 @@ class InstancedLayout:
         """Those of the geometries."""
         return self.geometries.shared_bytes
 
-    def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A name alone does not tell the instance."""
-        return self.named(names)[:2]
+    def named(
+        self, names: np.ndarray, instance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Faces and triangles of the flattened scene, and turns of corners where they stand."""
+        assert instance is not None
+        own_face, own_triangle, turns = self.geometries.named(names)
+        turns = np.where(self.mirrored[instance], (3 - turns) % 3, turns)
+        return *self._flattened(own_face, own_triangle, instance), turns
 
-    def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A name alone does not tell the instance."""
-        raise UsageError(
-            "a triangle's name does not tell its instance",
-            where="instances",
-            remedy="use instances flattened",
-        )
+    def _flattened(
+        self, own_face: np.ndarray, own_triangle: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Faces and triangles of the flattened scene from those of geometries."""
+        geometry, numbers = self.numbers.geometry[instance], self.numbers
+        face = own_face + (numbers.first_face[instance] - self.first_face[geometry])
+        triangle = own_triangle + (numbers.first_triangle[instance] - self.first_triangle[geometry])
+        return face.astype(np.int32), triangle.astype(np.int32)
 
     def stream(
         self, scene: Any, rays: Rays, mesh: Mesh, options: WalkOptions
@@ -173,29 +211,68 @@ class InstancedLayout:
         """Trace any number of rays; yield slices of them and results, in order."""
         yield from stream_through(instances_program(mesh, options), scene, rays, mesh, GPU_TILES)
 
+    def corners_of(
+        self, names: np.ndarray, instance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `layout.Layout`; corners where they stand, as `standing` places them."""
+        assert instance is not None
+        own, turns = self.geometries.corners_of(names)
+        matrix = self.places.matrices.view(np.float64)[instance, :, :, 0, None]
+        x, y, z = (own[:, None, axis].astype(np.float64) for axis in range(3))
+        placed = ((matrix[:, :, 0] * x + matrix[:, :, 1] * y) + matrix[:, :, 2] * z) + matrix[:, :, 3]
+        corners = placed.astype(np.float32)
+        corners[np.abs(corners) < np.finfo(np.float32).tiny] = 0
+        mirrored = self.mirrored[instance]
+        corners[mirrored] = corners[mirrored][:, :, [0, 2, 1]]
+        turns = np.where(mirrored, (3 - turns) % 3, turns)
+        first = _first_corners(corners)
+        order = (np.arange(3) + first[:, None]) % 3
+        return np.take_along_axis(corners, order[:, None], axis=2), ((turns + first) % 3).astype(np.int32)
+
+    def names(self) -> np.ndarray:
+        """See `layout.Layout`: of the triangles of geometries, which stand in several places."""
+        return self.geometries.names()
+
+    def corner_blocks(self, most: int) -> Iterator[np.ndarray]:
+        """See `layout.Layout`: placed, instance by instance."""
+        names, numbers = self.names(), self.numbers
+        end = int(numbers.first_triangle[-1] + np.diff(self.first_triangle)[numbers.geometry[-1]])
+        for first in range(0, end, most * WIDTH):
+            triangle = np.arange(first, min(end, first + most * WIDTH))
+            instance = numbers.instance_of(triangle)
+            own = (
+                triangle - numbers.first_triangle[instance] + self.first_triangle[numbers.geometry[instance]]
+            )
+            yield blocks_of(self.corners_of(names[own], instance)[0])
+
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle of the flattened scene."""
         t, face, u, v, triangle = found
-        instance = traced[4]
-        hit = np.flatnonzero(instance >= 0)
+        hit = np.flatnonzero(traced[4] >= 0)
         t[at] = traced[0]
-        instance, rows = instance[hit], at[hit]
-        own_t, own_face, own_u, own_v, own_triangle = (
-            np.zeros(min(len(hit), len(one)), one.dtype) for one in found
-        )
-        inside = (own_t, own_face, own_u, own_v, own_triangle)
-        local = rays
+        rows, names, instance = at[hit], traced[1][hit], traced[4][hit]
+        face[rows], triangle[rows], _ = self.named(names, instance)
         if len(u):
-            local = (*self.moved(rays[0][rows], rays[1][rows], instance), rays[2][rows])
-        given = (np.arange(len(hit), dtype=np.int32), (traced[0][hit], traced[1][hit]))
-        self.geometries.weigh(local, *given, inside)
-        geometry, turned = self.numbers.geometry[instance], self.mirrored[instance]
-        face[rows] = own_face + (self.numbers.first_face[instance] - self.first_face[geometry])
-        triangle[rows] = own_triangle + (
-            self.numbers.first_triangle[instance] - self.first_triangle[geometry]
-        )
-        if len(u):
-            u[rows], v[rows] = np.where(turned, own_v, own_u), np.where(turned, own_u, own_v)
+            weights = self._weights_in_place if self.in_place else self._weights_moved
+            u[rows], v[rows] = weights((rays[0][rows], rays[1][rows], rays[2][rows]), names, instance)
+
+    def _weights_moved(
+        self, rays: Rays, names: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """U and v of rays that hit these triangles, as they are moved into their geometries."""
+        u, v = _weights_by(self.geometries, (*self.moved(rays[0], rays[1], instance), rays[2]), names)
+        turned = self.mirrored[instance]
+        return np.where(turned, v, u), np.where(turned, u, v)
+
+    def _weights_in_place(
+        self, rays: Rays, names: np.ndarray, instance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same of rays that are not moved, and of triangles where they stand."""
+        corners, turns = self.corners_of(names, instance)
+        count = len(names)
+        place = np.arange(count, dtype=np.int32) * 4 + turns
+        held = LeafBlocks(blocks_of(corners), place, np.zeros(0, np.int32), self.arrays.frame.scale)
+        return _weights_by(held, rays, np.arange(count, dtype=np.int32))
 
     def moved(
         self, origins: np.ndarray, directions: np.ndarray, instance: np.ndarray
@@ -208,6 +285,25 @@ class InstancedLayout:
             origin = _turned(matrix, origins * self.arrays.frame.scale) + matrix[:, :, 3]
             scale = self.geometries.arrays.frame.scale
             return origin / scale, _turned(matrix, shortened)
+
+
+def _weights_by(layout: Layout | LeafBlocks, rays: Rays, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """U and v of rays that hit what is so named in a layout."""
+    count = len(names)
+    t, u, v = np.zeros((3, count), np.float32)
+    face, triangle = np.zeros((2, count), np.int32)
+    layout.weigh(rays, np.arange(count, dtype=np.int32), (t, names), (t, face, u, v, triangle))
+    return u, v
+
+
+def _first_corners(corners: np.ndarray) -> np.ndarray:
+    """(k,): which corner of (k, 3, 3), a row an axis, is the least by (x, y, z), the first of equals."""
+    rows, first = np.arange(len(corners)), np.zeros(len(corners), np.int64)
+    for j in (1, 2):
+        here, there = corners[rows, :, first], corners[:, :, j]
+        axis = (here != there).argmax(axis=1)
+        first = np.where(there[rows, axis] < here[rows, axis], j, first)
+    return first
 
 
 def _turned(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -229,7 +325,9 @@ def instances_program(mesh: Mesh, options: WalkOptions) -> Any:
     return jax.jit(split)
 
 
-def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = False) -> InstancedLayout:
+def lay_out_instanced(
+    scene: "Scene", threads: int = 1, *, compressed: bool = False, in_place: bool = False
+) -> InstancedLayout:
     """Lay a scene with instances out, each geometry once.
 
     Args:
@@ -237,6 +335,7 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         threads: Threads to build with.
         compressed: Keep the blocks as they lie, under the hierarchy of the file; else geometries are
             expanded, under new hierarchies.
+        in_place: See `InstancedLayout`.
 
     Raises:
         UsageError: An instance is so sheared, so small or so far from its geometry's origin that float32
@@ -262,6 +361,8 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         # Planes of packed boxes are counted from the scene's low, whatever the geometry.
         reaches[:] = float(geometries.arrays.frame.reach)
     geometry, size = numbers.geometry, size_class(len(scene.instances))
+    starts = scene.spans.face_starts.astype(np.int64)
+    first_face = starts[:-1] if scene.remap is None else scene.geometries.first_face
     zero, one = np.zeros(3, np.float32), np.ones(3, np.float32)
     arrays = InstancedScene(
         nodes,
@@ -271,16 +372,18 @@ def lay_out_instanced(scene: "Scene", threads: int = 1, *, compressed: bool = Fa
         Frame(moves.scale, np.float32(moves.reach), zero, one, MARGIN),
         geometries.arrays,
     )
-    starts = scene.spans.face_starts[:-1].astype(np.int64)
-    return InstancedLayout(
+    layout = InstancedLayout(
         arrays,
         geometries,
         max(wide.depth, geometries.depth),
         numbers,
         starts,
-        starts if scene.remap is None else scene.geometries.first_face,
-        scene.instances.placed.mirrored,
+        first_face,
+        scene.instances.placed,
+        (moves.slips * (1 + 2 * U)).astype(np.float32),
+        in_place,
     )
+    return replace(layout, arrays=arrays._replace(places=layout.places)) if in_place else layout
 
 
 def geometry_boxes(scene: "Scene") -> Float64[np.ndarray, "g 6"]:
@@ -341,6 +444,32 @@ def _slips(
     off = (gamma_4 * k + n + 2 * slip + gamma_4 * h + r) / (1 - slip)
     test = REACH * (k + h + row_sum(np.abs(a)) * extent / reach)
     return np.where(slip < MOST_SLIP, (off + test + OTHER_SLIPS) * (1 + 2.0**-10), np.inf)
+
+
+def stretch_bounds(places: Float64[np.ndarray, "k 3 4"]) -> Float32[np.ndarray, "k 3 4"]:
+    """Axes of each geometry, and how much each is stretched along them at least (`walk_points_instances`).
+
+    In three rows for each: an axis v, and w. Of any vector y of the geometry what it becomes is no shorter
+    than that of the lengths w (v . y).
+    """
+    matrix = places[:, :, :3]
+    axes = np.tile(np.eye(3, dtype=np.float32), (len(matrix), 1, 1))
+    least, length = _stretches(matrix)
+    sheared = np.flatnonzero(least < UPRIGHT)
+    if len(sheared):
+        axes[sheared] = np.linalg.svd(matrix[sheared])[2].astype(np.float32)
+        least[sheared], length[sheared] = _stretches(
+            matrix[sheared] @ np.linalg.inv(axes[sheared].astype(np.float64))
+        )
+    stretch = np.sqrt(np.maximum(least, 0))[:, None] * length * (1 - 2.0**-20)
+    return np.concatenate([axes, stretch[:, :, None].astype(np.float32)], axis=2)
+
+
+def _stretches(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the columns of matrices (k, 3, 3): l of `walk_points_instances`, no more than it is, and lengths."""
+    length = np.linalg.norm(matrix, axis=1)
+    upright = matrix / length[:, None, :]
+    return np.linalg.eigvalsh(np.swapaxes(upright, 1, 2) @ upright)[:, 0] - 2.0**-40, length
 
 
 def _expanded(scene: "Scene", threads: int) -> tuple[Layout, np.ndarray]:

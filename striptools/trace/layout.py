@@ -1,11 +1,12 @@
 """What a tracer needs of a scene laid out for a walk, expanded or packed."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from striptools.trace.counters import Counters
-from striptools.trace.walk import Decode, Frame
+from striptools.trace.walk import WIDTH, Decode, Frame
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Origins (r, 3), directions (r, 3) and t_max (r,), float32."""
@@ -97,3 +98,22 @@ class Layout(Protocol):
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles (k,) of what a walk names, and turns: corner j is the face's (j + turn) % 3."""
         ...
+
+    def names(self) -> np.ndarray:
+        """(n,) int32: what a walk names each triangle in file order."""
+        ...
+
+    def corner_blocks(self, most: int) -> Iterator[np.ndarray]:
+        """All triangles where they stand, in blocks of eight, `most` at a time: (l, 9, 8) float32, scaled.
+
+        X of corners a, b and c, then y, then z; not a number in empty lanes.
+        """
+        ...
+
+
+def blocks_of(corners: np.ndarray) -> np.ndarray:
+    """Corners (k, 3, 3), a row an axis, in blocks of eight lanes: (l, 9, 8), not a number in those left."""
+    count = -(-len(corners) // WIDTH)
+    lanes = np.full((count * WIDTH, 9), np.nan, np.float32)
+    lanes[: len(corners)] = corners.reshape(-1, 9)
+    return np.ascontiguousarray(lanes.reshape(count, WIDTH, 9).transpose(0, 2, 1))

@@ -1,5 +1,6 @@
 """A scene laid out for the walk, expanded: wide nodes, leaf blocks, and the way from a face to its place."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -94,6 +95,20 @@ class ExpandedLayout:
         triangle_of = self.leaves.triangle_of
         triangles = triangle_of[names] if len(triangle_of) else names
         return names, triangles, self.leaves.place[names] & 3
+
+    def names(self) -> np.ndarray:
+        """See `layout.Layout`: the faces that they are reported as."""
+        triangle_of = self.leaves.triangle_of
+        if len(triangle_of) == 0:
+            return np.arange(len(self.leaves.place), dtype=np.int32)
+        faces = np.flatnonzero(triangle_of >= 0).astype(np.int32)
+        return faces[np.argsort(triangle_of[faces])]
+
+    def corner_blocks(self, most: int) -> Iterator[np.ndarray]:
+        """See `layout.Layout`: those that the walk has."""
+        blocks = self.leaves.blocks
+        for first in range(0, len(blocks), most):
+            yield blocks[first : first + most, :9]
 
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""

@@ -1,6 +1,6 @@
 """A scene laid out for the walk as it lies in its file: packed blocks, quantised nodes, runs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
 from striptools.kernels.weighing_double import packed_corners
 from striptools.trace.counters import Counters
-from striptools.trace.layout import Found, PacketView, Rays, packet_view
+from striptools.trace.layout import Found, PacketView, Rays, blocks_of, packet_view
 from striptools.trace.leaves import CACHE_LINE, aligned_zeros, reach_of, scale_of, size_class
 from striptools.trace.walk import WIDTH, Decode, Frame
 from striptools.trace.walk_packed import MARGIN, PackedScene
@@ -109,6 +109,19 @@ class PackedLayout:
         faces = self.arrays.faces[triangles] if self.arrays.has_faces else triangles
         turns = self.rotations[triangles] if len(self.rotations) else np.zeros(len(names), np.uint8)
         return faces, triangles, turns
+
+    def names(self) -> np.ndarray:
+        """See `layout.Layout`: 256 times the block and the number there."""
+        headers = self.arrays.headers[: self.blocks]
+        first, count = headers[:, 0].astype(np.int64), (headers[:, 2] & 0xFF).astype(np.int64) + 1
+        block = np.repeat(np.arange(self.blocks), count)
+        return (block << 8 | (np.arange(len(block)) - first[block])).astype(np.int32)
+
+    def corner_blocks(self, most: int) -> Iterator[np.ndarray]:
+        """See `layout.Layout`: decoded."""
+        names = self.names()
+        for first in range(0, len(names), most * WIDTH):
+            yield blocks_of(self.corners_of(names[first : first + most * WIDTH])[0])
 
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""

@@ -70,8 +70,10 @@ class Tracer:
     In a scene with instances a hit's face is that of the flattened source (`Mesh.flattened` of the mesh that
     was converted), its triangle one of `scene.placed()`; instance, geometry and the face within it are told
     beside. "shared" keeps each geometry once and moves rays into its frame: inside each instance as
-    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). Where
-    geometries are expanded, `hierarchy` is always rebuilt.
+    watertight, and t is that of the moved ray, which float32 puts off a little (`walk_instances`). What is
+    asked by another triangle test, and closest points, are the bits of the flattened scene: triangles are
+    put where they stand as they are met (`standing`). Where geometries are expanded, `hierarchy` is always
+    rebuilt.
 
     A scene under a hierarchy of its own (SLBVH, kd-tree, presorted, loose octree) is walked through that for
     closest and any hits. All other queries go through wide nodes, rebuilt on the first of them, and so they
@@ -97,11 +99,8 @@ class Tracer:
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
-            geometry once, for all that is asked of rays: hits, counts, and `contains` by parity. What is
-            measured where triangles stand, closest points and winding numbers, needs "flattened", and so do
-            triangle tests other than the default one, since rays are rounded as they are moved. "auto"
-            flattens what fits in `memory_budget`, and shares where it does not or where `resident` is
-            compressed.
+            geometry once. "auto" flattens what fits in `memory_budget`, and shares where it does not or where
+            `resident` is compressed.
         test: How a ray and a triangle are tested (`trace.triangle_tests`; bounds in `measure.bound`):
             "watertight" lets no ray slip through a closed surface, and counts as hit what is as near to it as
             float32 rounds; "fast" is Moeller and Trumbore's, which leaks; "exact-sign" hits exactly what
@@ -149,8 +148,6 @@ class Tracer:
         self._numbers = None if scene.instances is None else InstanceNumbers.of(scene)
         if not self._empty:
             self._take(self._laid_out(scene, hierarchy, self._builders(threads)))
-            if test != "watertight":
-                self._refuse_shared(f"triangle test {test} does not")
         beside = not self._empty and not self._shared and not self._has_each_once
         self._rebuild = partial(self._with_each_once, scene, device, threads) if beside else None
 
@@ -201,7 +198,8 @@ class Tracer:
         if scene.hierarchy is not None and hierarchy == "stored":
             return lay_out_alternative(scene, scene.hierarchy, threads)
         if self._shared:
-            return lay_out_instanced(scene, threads, compressed=self._resident == "compressed")
+            compressed, in_place = self._resident == "compressed", self._test != "watertight"
+            return lay_out_instanced(scene, threads, compressed=compressed, in_place=in_place)
         if self._resident == "compressed":
             return lay_out_packed(scene, threads)
         if hierarchy == "stored":
@@ -219,8 +217,17 @@ class Tracer:
 
     def _take(self, layout: Layout) -> None:
         self._layout: Layout = layout
-        self._scene = replicate(layout.arrays, self._mesh)
+        self._scene: Any = replicate(layout.arrays, self._mesh)
+        self.__dict__.pop("_standing", None)
         self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
+
+    @cached_property
+    def _standing(self) -> Any:
+        """The scene on the devices; of shared instances where they stand, too."""
+        if not isinstance(self._layout, InstancedLayout):
+            return self._scene
+        places: Any = self._layout.places
+        return self._scene._replace(places=replicate(places, self._mesh))
 
     @property
     def devices(self) -> list[Any]:
@@ -312,7 +319,7 @@ class Tracer:
         told = (t, face, u[:0], v[:0], triangle) if in_double else found
         self._layout.weigh(rays, at, traced, told)
         if in_double:
-            weigh_in_double(self._layout, rays, at, traced[1], found)
+            weigh_in_double(self._layout, rays, at, traced, found)
         elif len(u) > 0 and self._test == "fast":
             weights_inside(at, found)
 
@@ -390,7 +397,7 @@ class Tracer:
 
         Where on its triangle it is, and how far, is computed in float64. Which triangle it is was decided in
         float32: none is closer by more than 2**-20 of the largest coordinate of point and scene. Of equal
-        ones it is the least face.
+        ones it is the least face. Through shared instances it is bit for bit that of the flattened scene.
 
         Args:
             points: (r, 3) in the frame of the scene's positions. A point that is not finite, or 2**60 times
@@ -398,16 +405,16 @@ class Tracer:
             signed: Make distances negative inside, by `contains` by parity: for closed meshes.
 
         Raises:
-            UsageError: The points are not of this shape, or instances are shared.
+            UsageError: The points are not of this shape.
             StriptoolsError: As for `closest_hit`.
         """
         checked = checked_points(points)
         if self._empty:
             found = nothing_closest(len(checked))
         else:
-            wide = self._wide_nodes("closest points do not")
+            wide = self._gatherer()
             options = PointOptions(wide._stack_size, wide._on_gpu, wide._layout.decode)
-            found = closest_points(wide._scene, wide._layout, checked, wide._mesh, options)
+            found = closest_points(wide._standing, wide._layout, checked, wide._mesh, options)
         if signed:
             inside = self.contains(checked)
             found.distance[inside] *= -1
@@ -427,8 +434,7 @@ class Tracer:
             method: "parity" or "winding".
 
         Raises:
-            UsageError: The points are not of this shape, there is no such method, or it is winding and the
-                scene is kept compressed or its instances shared.
+            UsageError: The points are not of this shape, or there is no such method.
             StriptoolsError: As for `closest_hit`.
         """
         if method == "winding":
@@ -441,55 +447,52 @@ class Tracer:
         """The generalised winding number of the mesh at each point, 0 at points that are not finite.
 
         1 inside and 0 outside of a closed mesh whose faces are wound counter-clockwise from outside; in
-        between where there are holes. Each point takes each triangle.
+        between where there are holes. Each point takes each triangle, placed or decoded where it is not kept
+        so: through shared instances within 1e-5 or so of the flattened scene's, whose sums are others.
 
         Args:
             points: (r, 3) in the frame of the scene's positions.
 
         Raises:
-            UsageError: The points are not of this shape, or the scene is kept compressed or its instances
-                shared.
+            UsageError: The points are not of this shape.
         """
         checked = checked_points(points)
         if self._empty:
             return np.zeros(len(checked), np.float32)
-        wide = self._wide_nodes("winding numbers do not")
-        if self._resident == "compressed":
-            raise UsageError(
-                "winding numbers need an expanded scene", where="resident", remedy="use expanded, or parity"
-            )
-        return winding_numbers(wide._layout.arrays, checked)
+        return winding_numbers(self._gatherer()._layout, checked)
 
     def program_parts(self) -> tuple[Any, WalkOptions]:
         """The scene on the first device and how a CPU or GPU walks it, for `functional.Geometry`.
 
         Raises:
-            UsageError: There is nothing to trace, or instances are shared.
+            UsageError: There is nothing to trace.
         """
         if self._empty:
             raise UsageError("a scene without triangles", remedy="trace it by the tracer itself")
-        wide = self._wide_nodes("functions of arrays do not")
+        wide = self._gatherer()
         options = wide._options()
         assert options is not None
         with quiet_jax():
-            return jax.device_put(wide._layout.arrays, self.devices[0]), options
+            layout, arrays = wide._layout, wide._layout.arrays
+            if isinstance(layout, InstancedLayout):
+                arrays = arrays._replace(places=layout.places)
+            return jax.device_put(arrays, self.devices[0]), options
 
     def _gatherer(self) -> "Tracer":
-        """The tracer that gathers hits: this one through shared instances, else that of wide nodes."""
-        return self if self._shared else self._wide_nodes("only closest hits and any hits")
+        """The tracer for more than closest and any hits, of nodes that have each triangle in one leaf.
 
-    def _wide_nodes(self, refused: str) -> "Tracer":
-        """The tracer of wide nodes that have each triangle in one leaf: this one, or one beside it.
+        This one through shared instances and wide nodes, else one of wide nodes beside it.
 
         Raises:
-            UsageError: There is none, naming what is `refused` to go through this layout.
+            UsageError: There is none.
         """
-        self._refuse_shared(refused)
-        if self._empty or self._has_each_once:
+        if self._empty or self._shared or self._has_each_once:
             return self
         if self._rebuild is None:
             raise UsageError(
-                f"{refused} go through this hierarchy", where="hierarchy", remedy="trace a scene under it"
+                "only closest hits and any hits go through this hierarchy",
+                where="hierarchy",
+                remedy="trace a scene under it",
             )
         return self._rebuilt
 
@@ -498,15 +501,6 @@ class Tracer:
         """The same scene under wide nodes that have each triangle in one leaf."""
         assert self._rebuild is not None
         return self._rebuild()
-
-    def _refuse_shared(self, refused: str) -> None:
-        """Refuse what cannot go through shared instances."""
-        if self._shared:
-            raise UsageError(
-                f"{refused} go through shared instances",
-                where="instances",
-                remedy="use instances flattened",
-            )
 
     def _gather(
         self, rays: Rays, kind: GatherKind, most: int

@@ -14,6 +14,11 @@ stack of its own, and the closest hit is carried back.
    in the order of instances.
 5. All hits are gathered in each geometry, as many as are asked for, and merged by t, instance and face;
    counts are summed. A mirrored instance counts windings the other way round, which parity does not see.
+6. Triangle tests other than the watertight one are of the ray as it is and of triangles where they stand
+   (`standing`): hits, t, u and v are the bits of the flattened scene. Only boxes are met by the moved ray. By
+   what follows, a place in a geometry that stands for a hit is, once put in the scene, within f s of what the
+   moved ray stands for there, and within 16 u s more, since corners are rounded and a test may report what
+   is beside the ray. Boxes are widened by that times the largest row sum of |W|.
 
 **Boxes.** In scaled units, with u = 2^-24 and gamma_n = n u / (1 - n u), let A, b place a geometry and W, w
 move a ray into it: float32, with AW = I + E and Aw + b = r, both known from float64. Of a ray o + t d the
@@ -42,24 +47,30 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from striptools.trace.box import Slab, lanes_met
+from striptools.trace.box import Slab, U, lanes_met
 from striptools.trace.counters import Counters
-from striptools.trace.numerics import in_range, index, larger, rounded
+from striptools.trace.numerics import in_range, index, larger, power_of_two_below, rounded
+from striptools.trace.standing import Places, Standing, standing
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
+    FLOATS,
     MISS,
     STUCK,
     WIDTH,
+    WORDS,
     Alone,
     Frame,
     ReadyRay,
+    Traced,
     WalkOptions,
     found_alone,
     largest_of,
     prepared_ray,
+    prepared_rays,
     scaled_ray,
     walk_alone,
 )
@@ -67,6 +78,13 @@ from striptools.trace.walk_gather import Gathered, bits_of, merged, nothing_gath
 
 NODE_BYTES = 256
 """What a node over instances reads: eight boxes, children, and factors."""
+
+SLAB = 9
+"""Words of a ready ray that are its slab, the first."""
+
+CORNER_SLIPS = np.float32(16 * U)
+"""How far a hit may be from the exact place of its triangle, in units of the largest coordinate: corners are
+rounded, and the test may report what is `box.REACH` beside the ray."""
 
 INSTANCE_BYTES = 60
 """What an instance reads: its matrix, root, reach and number."""
@@ -84,6 +102,7 @@ class InstancedScene(NamedTuple):
         reaches: (k,) float32, the largest scaled coordinate of its geometry.
         frame: How rays are seen from the scene.
         geometries: All geometries, in their own frames.
+        places: Where instances stand; None where only moved rays are asked for.
     """
 
     nodes: Any
@@ -92,6 +111,48 @@ class InstancedScene(NamedTuple):
     reaches: Any
     frame: Frame
     geometries: Any
+    places: Places | None = None
+
+    @property
+    def node_count(self) -> int:
+        """Nodes over instances."""
+        return len(self.nodes)
+
+    @property
+    def width(self) -> int:
+        """Children of a node."""
+        return WIDTH
+
+    def boxes_of(self, node: Array) -> Array:
+        """(6, 8) float32: boxes of instances or of several, scaled and not widened; NaN in empty lanes."""
+        return self.rows_of(node)[:6]
+
+    def rows_of(self, node: Array) -> Array:
+        """(8, 8) float32: a node."""
+        at = (index(node), jnp.uint32(0), jnp.uint32(0))
+        return lax.dynamic_slice(self.nodes, at, (1, 8, WIDTH))[0]
+
+    def child_of(self, node: Array, lane: Array) -> Array:
+        """The child in a lane; instance i is -(i + 1)."""
+        bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
+        return lax.bitcast_convert_type(bits, jnp.int32)
+
+    def find_leaf(self, child: Array) -> Array:
+        """The child."""
+        return child
+
+    def faces_of(self, names: Array) -> Array:
+        """Names that `trace_in_place` gives are faces."""
+        return names
+
+    def root_of(self, instance: Array) -> Array:
+        """The root of an instance's geometry."""
+        return value_at(self.roots, index(instance))
+
+    def standing(self, instance: Array) -> Standing:
+        """An instance where it stands."""
+        assert self.places is not None
+        return standing(self.geometries, self.places, instance)
 
     def visited(self, top: Array, below: Array) -> Array:
         """(6,) int32, `Counters` of so many nodes, leaves and triangles over instances and in geometries."""
@@ -180,6 +241,7 @@ class _Seen(NamedTuple):
     origin: Array
     direction: Array
     size: Array
+    in_place: bool
 
     @property
     def frame(self) -> Frame:
@@ -189,28 +251,26 @@ class _Seen(NamedTuple):
     @property
     def width(self) -> int:
         """Children of a node."""
-        return WIDTH
+        return self.scene.width
 
     @property
     def node_count(self) -> int:
         """Nodes over instances."""
-        return len(self.scene.nodes)
+        return self.scene.node_count
 
     def lanes_met(self, node: Array, slab: Slab, limit: Array) -> Array:
         """(8,) bool: the node's children whose widened boxes the ray meets, from 0 to `limit`."""
-        at = (index(node), jnp.uint32(0), jnp.uint32(0))
-        rows = lax.dynamic_slice(self.scene.nodes, at, (1, 8, WIDTH))[0]
+        rows = self.scene.rows_of(node)
         wider = rows[7] * self.size
         return lanes_met(jnp.concatenate([rows[:3] - wider, rows[3:6] + wider]), slab, limit)
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; instance i is -(i + 1)."""
-        bits = lax.dynamic_slice(self.scene.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
-        return lax.bitcast_convert_type(bits, jnp.int32)
+        return self.scene.child_of(node, lane)
 
     def find_leaf(self, child: Array) -> Array:
         """The child."""
-        return child
+        return self.scene.find_leaf(child)
 
     def triangles_of(self, where: Array) -> Array:
         """Triangles are counted in the geometries."""
@@ -219,17 +279,42 @@ class _Seen(NamedTuple):
     def visit_leaf(self, shear: Shear, where: Array, best: Any, options: WalkOptions) -> Any:
         """Walk the geometry of an instance."""
         number = -(where + 1)
-        at = index(number)
-        matrix = lax.dynamic_slice(self.scene.matrices, (at, jnp.uint32(0), jnp.uint32(0)), (1, 3, 4))[0]
-        origin, direction = moved(matrix, self.origin, self.direction)
-        geometries = self.scene.geometries
-        frame = geometries.frame._replace(scale=jnp.float32(1), reach=_at(self.scene.reaches, at))
-        seen = geometries._replace(frame=frame)
         # A GPU goes through the motions for rays that are at no leaf.
         there = (where < 0) & (where != DONE)
         limit = jnp.where(there, best.limit, 0)
-        row = prepared_ray(seen, origin, direction, limit, _at(self.scene.roots, at))
+        if self.in_place:
+            seen, row = self._standing_at(index(number), limit, shear)
+        else:
+            seen, row = self._moved_into(index(number), limit)
         return best.after(number, seen, walk_alone(seen, row, options), options)
+
+    def _moved_into(self, at: Array, limit: Array) -> tuple[Any, Array]:
+        """The geometry of an instance, and the ray ready in its frame."""
+        origin, direction = moved(row_of(self.scene.matrices, at), self.origin, self.direction)
+        geometries = self.scene.geometries
+        frame = geometries.frame._replace(scale=jnp.float32(1), reach=value_at(self.scene.reaches, at))
+        seen = geometries._replace(frame=frame)
+        return seen, prepared_ray(seen, origin, direction, limit, value_at(self.scene.roots, at))
+
+    def _standing_at(self, at: Array, limit: Array, shear: Shear) -> tuple[Any, Array]:
+        """An instance where it stands, and the ray: as it is moved for boxes, as it is for triangles."""
+        scene, matrix = self.scene, row_of(self.scene.matrices, at)
+        origin, direction = moved(matrix, self.origin, self.direction)
+        own = scene.geometries.frame
+        assert scene.places is not None
+        slip = (value_at(scene.places.slips, at) + CORNER_SLIPS) * self.size
+        wider = jnp.abs(matrix[:, :3]).sum(axis=1).max() * slip * np.float32(1 + 2.0**-18)
+        reach = larger(largest_of(origin), value_at(scene.reaches, at)) + wider / own.margin
+        seen = scene.geometries._replace(frame=own._replace(scale=jnp.float32(1), reach=reach))
+        row = prepared_ray(seen, origin, direction, limit, value_at(scene.roots, at))
+        # Distances of boxes in t of the walk over instances, whose direction is not made shorter here.
+        slab = row[:SLAB] * power_of_two_below(largest_of(direction))[0]
+        rest = jnp.stack([*shear.origin, shear.x, shear.y, shear.z, limit, jnp.float32(1)])
+        axes = lax.bitcast_convert_type(jnp.stack(shear.axes).astype(jnp.int32), jnp.float32)
+        row = jnp.concatenate([slab, rest, axes, row[FLOATS + 3 : WORDS]])
+        if shear.way is not None:
+            row = jnp.concatenate([row, jnp.stack(shear.way)])
+        return scene.standing(at), row
 
 
 def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]:
@@ -248,14 +333,43 @@ def moved(matrix: Array, origin: Array, direction: Array) -> tuple[Array, Array]
     return turned(origin) + matrix[:, 3], turned(direction)
 
 
-def trace_instances(
+def trace_in_place(
     scene: InstancedScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+) -> Traced:
+    """Trace r rays as through the flattened scene (difference 6): names are faces, of any hits `walk.HIT`."""
+    found = trace_instances(scene, origins, directions, t_max, options, in_place=True)
+    if options.any_hit:
+        return Traced(found.t, found.name, found.counters, found.counted)
+    hit = found.name >= 0
+    assert scene.places is not None
+    own = scene.geometries.faces_of(jnp.where(hit, found.name, 0))
+    face = own + scene.places.faces[jnp.where(hit, found.instance, 0)]
+    return Traced(found.t, jnp.where(hit, face, found.name), found.counters, found.counted)
+
+
+def trace_instances(
+    scene: InstancedScene,
+    origins: Array,
+    directions: Array,
+    t_max: Array,
+    options: WalkOptions,
+    in_place: bool = False,
 ) -> InstancesTraced:
-    """Trace r rays, one by one or all at once; arguments are those of `walk.trace_rays`."""
+    """Trace r rays, one by one or all at once.
+
+    Args:
+        scene: What to trace.
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+        t_max: (r,) float32.
+        options: What to compile in.
+        in_place: Let rays meet triangles where they stand, as tests other than the watertight one have it.
+    """
     options = options._replace(interleave=1)
+    in_place = in_place or options.test != "watertight"
 
     def walk(*ray: Array) -> InstancesTraced:
-        return _walk_ray(scene, ray, options)
+        return _walk_ray(scene, ray, options, in_place)
 
     rays = (origins, directions, t_max)
     if options.batch:
@@ -266,11 +380,14 @@ def trace_instances(
     return found._replace(t=jnp.zeros(0)) if options.any_hit else found
 
 
-def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions) -> InstancesTraced:
+def _walk_ray(
+    scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions, in_place: bool
+) -> InstancesTraced:
     """Walk one ray over the instances."""
     origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
-    seen = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach))
-    row = prepared_ray(seen, ray[0], ray[1], ray[2], jnp.int32(0))
+    # Of a `WalkScene` it has what the walk of one ray asks.
+    seen: Any = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach), in_place)
+    row = prepared_rays(seen, ray[0][None], ray[1][None], ray[2][None], options.test)[0]
     none = jnp.int32(MISS)
 
     def nothing(ready: ReadyRay) -> Any:
@@ -291,8 +408,14 @@ def _walk_ray(scene: InstancedScene, ray: tuple[Array, ...], options: WalkOption
     return InstancesTraced(t, name, counters, counted, instance)
 
 
-def _at(values: Array, place: Array) -> Array:
+def value_at(values: Array, place: Array) -> Array:
+    """One of (k,) values."""
     return lax.dynamic_slice(values, (place,), (1,))[0]
+
+
+def row_of(rows: Array, place: Array) -> Array:
+    """One of k rows."""
+    return lax.dynamic_index_in_dim(rows, place, keepdims=False)
 
 
 def _next_above(value: Array) -> Array:

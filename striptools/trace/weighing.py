@@ -14,19 +14,22 @@ def weights_inside(at: np.ndarray, found: Found) -> None:
     u[rays], v[rays] = one, np.minimum(two, 1 - one)
 
 
-def weigh_in_double(layout: Layout, rays: Rays, at: np.ndarray, names: np.ndarray, found: Found) -> None:
+def weigh_in_double(
+    layout: Layout, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found
+) -> None:
     """Write u and v anew, in float64, rounded to float32 last.
 
     Args:
         layout: Of the scene.
         rays: All of them.
         at: (k,) int32, the rays that results are for, negative for none.
-        names: (k,) int32, what the walk names the triangles hit; negative on a miss.
+        traced: What the walk told of each: (k,) int32 names of the triangles hit, negative on a miss, are the
+            second, and behind the fourth comes what a layout needs besides.
         found: What was found, of which u and v are written.
     """
-    hit = np.flatnonzero((at >= 0) & (names >= 0))
+    hit = np.flatnonzero((at >= 0) & (traced[1] >= 0))
     if len(hit) == 0:
         return
-    corners, turns = layout.corners_of(names[hit])
+    corners, turns = layout.corners_of(*(column[hit] for column in (traced[1], *traced[4:])))
     scale = layout.arrays.frame.scale
     weigh_corners(rays[0], rays[1], at[hit], corners, turns, scale, found[2], found[3])
