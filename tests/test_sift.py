@@ -67,9 +67,7 @@ def sieved(rays, share, compiled=fast):
 
 
 @settings(max_examples=200, deadline=None)
-@given(
-    st.integers(0, 2**32 - 1), st.sampled_from([0, -60, -30, 30, 40]), st.sampled_from([0.0, 1e3, 1e-20])
-)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0, -60, -30, 30, 40]), st.sampled_from([0.0, 1e3, 1e-20]))
 def test_all_that_is_nearer_passes(seed, exponent, offset):
     rays = aimed(seed, exponent, offset)
     for share in (1.0, 1.5, np.inf):

@@ -22,7 +22,7 @@ from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.triangle_tests import IN_DOUBLE
 from striptools.trace.walk import Best, Decode, Leaf, WalkOptions, found_any, nearer
-from striptools.trace.walk_packed import _first_corner as first_corner
+from striptools.trace.walk_packed import first_corner
 
 
 class Places(NamedTuple):

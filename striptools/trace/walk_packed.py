@@ -197,7 +197,7 @@ class PackedScene(NamedTuple):
         header = self._settled(self._row(self.headers, where.block, 0, 8))
         x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
-        return Leaf(ax, ay, az, _first_corner(x, y, z), *self._named(where))
+        return Leaf(ax, ay, az, first_corner(x, y, z), *self._named(where))
 
     def leaf_for_packets(
         self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None
@@ -483,7 +483,7 @@ def _along(x: list[Array], y: list[Array], z: list[Array], axis: Array) -> Corne
     return a, b, c
 
 
-def _first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
+def first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
     """Which corner is the least by (x, y, z), the first of equals: as `kernels.wide.first_corner` has it."""
 
     def before(i: int, j: int) -> Array:
