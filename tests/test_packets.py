@@ -18,7 +18,7 @@ from striptools.mesh.mesh import Mesh
 from striptools.options import Options
 from striptools.trace import Tracer
 from striptools.trace import walk_packets as walk
-from striptools.trace.launch import program
+from striptools.trace.launch import EVERY_RAY, program
 from striptools.trace.rays import Camera, camera_rays
 
 FIELDS = ("t", "face", "u", "v", "triangle")
@@ -182,7 +182,7 @@ def packets_of(scene, origins, directions, t_max=np.inf):
     alone, dropped = np.zeros(count + PACKET, np.int32), np.zeros(count, np.uint8)
     reach = np.full(count, t_max, np.float32)
     places = (rows, rows.view(np.int32), at, alone, dropped)
-    made, left, end = ready_packets(origins, directions, reach, 0, *seen, *places)
+    made, left, end = ready_packets(origins, directions, reach, EVERY_RAY, 0, *seen, *places)
     assert end == count
     return made, alone[:left], rows[:made], at[:made], dropped
 

@@ -10,6 +10,7 @@ from strategies import sphere
 from striptools.kernels.packets import FAR, HEAD, PACKET, ROW, ready_packets
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
+from striptools.trace.launch import EVERY_RAY
 
 KINDS = ("camera", "parallel", "light", "surface", "aimed", "broken", "scattered")
 
@@ -95,7 +96,9 @@ def ready(layout, origins, directions, t_max, room=64):
     rows, at = np.zeros((room, ROW), np.float32), np.zeros((room, PACKET), np.int32)
     alone, dropped = np.full(len(origins) + PACKET, -7, np.int32), np.full(len(origins), 9, np.uint8)
     places = (rows, rows.view(np.int32), at, alone, dropped)
-    live, left, begin = ready_packets(origins, directions, t_max, 0, *layout.seen_by_packets, *places)
+    live, left, begin = ready_packets(
+        origins, directions, t_max, EVERY_RAY, 0, *layout.seen_by_packets, *places
+    )
     return live, rows[:live], at[:live], alone[:left], dropped, begin
 
 

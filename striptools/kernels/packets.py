@@ -54,10 +54,16 @@ FAR = np.float32(3.0e38)
 
 
 @inlined
-def take(origins, directions, t_max, begin, held, room):
+def ray_at(which, place):
+    """The ray at a place, of all of them or of those that are said."""
+    return np.int64(which[place]) if len(which) > 0 else place
+
+
+@inlined
+def take(origins, directions, t_max, which, begin, held, room):
     """Gather `held` rays into a room, and zeros behind them."""
     for k in range(PACKET):
-        r = begin + min(k, held - 1)
+        r = ray_at(which, begin + min(k, held - 1))
         for axis in range(3):
             room[ORIGIN + axis * PACKET + k] = origins[r, axis]
             room[WAY + axis * PACKET + k] = directions[r, axis]
@@ -158,35 +164,36 @@ def way_of(directions, r):
 
 
 @inlined
-def part_ways(directions, begin, end):
+def part_ways(directions, which, begin, end):
     """Whether a few of the rays show that they do not all go the same way."""
-    way = way_of(directions, (begin + end) >> 1)
+    way = way_of(directions, ray_at(which, (begin + end) >> 1))
     apart = False
     for k in (begin, (3 * begin + end) >> 2, (begin + 3 * end) >> 2, end - 1):
-        other = way_of(directions, k)
+        other = way_of(directions, ray_at(which, k))
         apart |= (way >= 0) & (other >= 0) & (other != way)
     return apart
 
 
 @inlined
-def send_alone(begin, end, single, alone):
+def send_alone(which, begin, end, single, alone):
     """Write rays down as going on their own; return how many do."""
     for k in range(begin, end):
-        single[alone + k - begin] = k
+        single[alone + k - begin] = ray_at(which, k)
     return alone + end - begin
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def ready_packets(
-    origins, directions, t_max, begin, seen, root, density, packets, words, at, single, dropped
+    origins, directions, t_max, which, begin, seen, root, density, packets, words, at, single, dropped
 ):
-    """Ready packets from ray `begin` on, 32 rays in a row each, until places are full or there are none left.
+    """Ready packets of 32 rays in a row, from the `begin`th on, until places are full or none are left.
 
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32.
         t_max: (r,) float32.
-        begin: The first ray to take.
+        which: (m,) int32, the rays to take, in this order; (0,) for all of them as they come.
+        begin: The first of them to take.
         seen: Scale, reach, and the margin of a box: float32.
         root: (6,) float32, the scaled box of the scene.
         density: Packets that may meet more triangles than this share of the scene's silhouette are left to
@@ -198,24 +205,25 @@ def ready_packets(
         dropped: (r,) uint8, written for the rays of packets: 0 has a row, 1 missed the scene, 2 is no ray.
 
     Returns:
-        The packets written, the rays that go on their own, and the first ray not taken.
+        The packets written, the rays that go on their own, and the first of the rays that was not taken.
     """
     scale, reach, margin_unit = seen
     count, alone = 0, 0
     room = np.zeros(ROOM, np.float32)
     lane_of = np.zeros(PACKET, np.int32)
-    r = begin
-    while r < len(origins):
+    every = len(which) if len(which) > 0 else len(origins)
+    place = begin
+    while place < every:
         if count == len(packets) or alone + PACKET > len(single):
-            return count, alone, r
-        begin, end = r, min(r + PACKET, len(origins))
-        r = end
-        if part_ways(directions, begin, end):
-            alone = send_alone(begin, end, single, alone)
+            return count, alone, place
+        begin, end = place, min(place + PACKET, every)
+        place = end
+        if part_ways(directions, which, begin, end):
+            alone = send_alone(which, begin, end, single, alone)
             continue
 
         # Take the axis and the side of the middle ray for that of all.
-        middle = (begin + end) >> 1
+        middle = ray_at(which, (begin + end) >> 1)
         mx = flushed(directions[middle, 0])
         my = flushed(directions[middle, 1])
         mz = flushed(directions[middle, 2])
@@ -223,16 +231,16 @@ def ready_packets(
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
         away = picked(mx, my, mz, z) < ZERO
-        take(origins, directions, t_max, begin, end - begin, room)
+        take(origins, directions, t_max, which, begin, end - begin, room)
         prepare(room, scale, x, y, z, away)
         live, same = gather_live(room, lane_of)
         if not same:
-            alone = send_alone(begin, end, single, alone)
+            alone = send_alone(which, begin, end, single, alone)
             continue
         for k in range(begin, end):
-            dropped[k] = 2
+            dropped[ray_at(which, k)] = 2
         for k in range(live):
-            dropped[begin + lane_of[k]] = 0
+            dropped[ray_at(which, begin + lane_of[k])] = 0
         if live == 0:
             continue
 
@@ -254,7 +262,7 @@ def ready_packets(
         tall = (y1 - y0) + (u1 - u0) * reached
         across = (root[x + 3] - root[x]) + (root[y + 3] - root[y])
         if not ((2 * live > end - begin) & (wide * tall <= density * across * across)):
-            alone = send_alone(begin, end, single, alone)
+            alone = send_alone(which, begin, end, single, alone)
             continue
 
         # Drop the packet if it misses the scene's box.
@@ -269,7 +277,7 @@ def ready_packets(
         meets &= y1 + u1 * (leave if u1 >= ZERO else entry) >= root[y]
         if not meets:
             for k in range(live):
-                dropped[begin + lane_of[k]] = 1
+                dropped[ray_at(which, begin + lane_of[k])] = 1
             continue
 
         # Write the head: bounds, depth and margin, then axes and the order of visits.
@@ -285,8 +293,8 @@ def ready_packets(
 
         # Write the rays.
         for k in range(PACKET):
-            at[count, k] = begin + lane_of[k] if k < live else -1
+            at[count, k] = ray_at(which, begin + lane_of[k]) if k < live else -1
         for k in range(8 * PACKET):
             row[HEAD + k] = room[k]
         count += 1
-    return count, alone, len(origins)
+    return count, alone, every

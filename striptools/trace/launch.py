@@ -12,6 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
+from striptools.kernels.pictures import row_width, tile_order
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.trace.device import SlowTracingWarning, quiet_jax
 from striptools.trace.layout import Layout, Rays
@@ -157,7 +158,7 @@ def stream_ready(
         dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
         mesh: The CPU devices.
         options: What to compile in.
-        packets: Put rays that go the same way into packets.
+        packets: Put rays that go the same way into packets: of those of a picture, tile by tile.
 
     Yields:
         Which rays these are, int32, -1 for none, and their results.
@@ -173,11 +174,12 @@ def stream_ready(
     alone = np.zeros(min(TILES[-1], count) + PACKET, np.int32)
     seen = layout.seen_by_packets
     assert seen is not None
-    begin = 0
+    width, begin = row_width(*rays[:2]), 0
+    order = tile_order(count, width) if width else EVERY_RAY
     while begin < count:
         rows, at = packed.room()
         places = (rows, rows.view(np.int32), at, alone, dropped)
-        live, left, begin = ready_packets(*rays, begin, seen.frame, seen.box, seen.density, *places)
+        live, left, begin = ready_packets(*rays, order, begin, seen.frame, seen.box, seen.density, *places)
         yield from packed.fill(live)
         if left:
             yield from _send_each(single, layout, rays, alone[:left], dropped)

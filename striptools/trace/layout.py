@@ -17,7 +17,7 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 PACKET_MARGIN = np.float32(2**-19)
 """Widening of a box in units of the largest coordinate: `walk_packets`, Boxes."""
 
-MOST_TRIANGLES = 1600
+MOST_TRIANGLES = 800
 """Triangles that a packet is expected to meet, if they lie evenly, beyond which its rays go on their own."""
 
 

@@ -51,6 +51,7 @@ from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits
 from striptools.trace.instanced import lay_out_instanced
+from striptools.trace.launch import EVERY_RAY
 from striptools.trace.leaves import lay_out
 from striptools.types import TriangleTest
 
@@ -386,7 +387,7 @@ def packed_share(scene: Scene, batches: list[Batch]) -> float:
         rows = np.zeros((-(-count // PACKET), PACKET_ROW), np.float32)
         at, alone = np.full((len(rows), PACKET), -1, np.int32), np.zeros(count + PACKET, np.int32)
         far, dropped = np.full(count, np.inf, np.float32), np.zeros(count, np.uint8)
-        given = (batch.rays.origins, batch.rays.directions, far, 0, seen.frame, seen.box, seen.density)
+        given = (batch.rays.origins, batch.rays.directions, far, EVERY_RAY, 0, *seen)
         live, _, _ = ready_packets(*given, rows, rows.view(np.int32), at, alone, dropped)
         packed, rays = packed + int((at[:live] >= 0).sum()), rays + count
     return packed / rays
