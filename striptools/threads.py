@@ -1,6 +1,6 @@
-"""Threads over nogil kernels: equal chunks of a range, parts by hash, and jobs that give rise to more jobs.
+"""Threads over nogil kernels: equal chunks, parts by hash, jobs that give rise to more, and work on the side.
 
-Neither decides anything: the caller's kernels write to disjoint places or return what is joined in order, so
+None decides anything: the caller's kernels write to disjoint places or return what is joined in order, so
 that results do not depend on the number of threads.
 """
 
@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
 SMALLEST_CHUNK = 1 << 14
 """Rows below which another thread is not worth its start."""
@@ -63,3 +63,39 @@ def run_jobs(work: Callable[..., Iterable[Iterable[int]]], first: tuple[int, ...
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             pending |= {pool.submit(work, *job) for future in done for job in future.result()}
+
+
+class Beside:
+    """A thread beside the caller's that does one piece of work after the other; leaving waits for the last.
+
+    An exception of a piece is raised by the next call, or on leaving.
+
+    Args:
+        threaded: Without it the caller does each piece at once.
+    """
+
+    def __init__(self, *, threaded: bool) -> None:
+        self._pool = ThreadPoolExecutor(1) if threaded else None
+        self._begun: Future[None] | None = None
+
+    def __enter__(self) -> "Beside":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+            if kind is None:
+                self._finish()
+
+    def do(self, work: Callable[..., None], *given: Any) -> None:
+        """Begin a piece, once the one before is done."""
+        if self._pool is None:
+            work(*given)
+            return
+        self._finish()
+        self._begun = self._pool.submit(work, *given)
+
+    def _finish(self) -> None:
+        if self._begun is not None:
+            self._begun.result()
+            self._begun = None

@@ -330,14 +330,17 @@ def test_order_of_faces_and_remap_change_nothing_but_names(ball):
         np.testing.assert_array_equal(other.t, first.t)
 
 
-def test_all_threads_give_what_one_gives(ball):
-    origins, directions = rays_at(ball, 5001, 4)
+@pytest.mark.parametrize("count", [5001, 200_001])
+def test_all_threads_give_what_one_gives(ball, count):
+    origins, directions = rays_at(ball, count, 4)
     one = Tracer(ball, device="cpu", threads=1)
     all_cores = Tracer(ball, device="cpu")
     assert len(one.devices) == 1
     first, other = one.closest_hit(origins, directions), all_cores.closest_hit(origins, directions)
     for name in ("t", "face", "u", "v", "triangle"):
         np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
+    for tracer in (one, all_cores):
+        np.testing.assert_array_equal(tracer.any_hit(origins, directions), first.hit)
 
 
 def test_walking_all_rays_at_once_gives_the_same(ball):

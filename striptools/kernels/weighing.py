@@ -167,3 +167,17 @@ def weigh_hits(
     if held > 0:
         take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of)
         weigh_held(room, held, scale, ray_of, turn_of, u, v)
+
+
+@kernel
+def mark_hits(at, found, hit):
+    """Whether each ray hits anything.
+
+    Args:
+        at: (k,) int32, the rays that results are for, negative for none; others are left alone.
+        found: (k,) int32, negative on a miss.
+        hit: (r,) bool, written.
+    """
+    for k in range(len(at)):
+        if at[k] >= 0:
+            hit[at[k]] = found[k] >= 0

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from striptools.errors import UsageError
+from striptools.kernels.weighing import mark_hits
 from striptools.kernels.wide import BROAD, WIDTH
-from striptools.threads import in_chunks
+from striptools.threads import Beside, in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
@@ -22,7 +23,7 @@ from striptools.trace.device import DeviceKind, core_count, quiet_jax, trace_dev
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.instanced import InstancedLayout, InstanceNumbers, lay_out_instanced
-from striptools.trace.launch import device_mesh, replicate, stream, stream_ready
+from striptools.trace.launch import TILES, device_mesh, replicate, stream, stream_ready
 from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import WideLayout, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
@@ -290,12 +291,14 @@ class Tracer:
         counted = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
         options = self._options(counting=counters)
-        for at, traced in self._stream(rays, dropped, options, packets=packets):
-            if counters:
-                counted[at] = traced[2]
-            check_ended(traced[1])
-            # On this side, while the devices are at the next rays.
-            self._weigh(rays, at, traced, found)
+        beside = self._mesh.size > 1 and count > TILES[-1]
+        with Beside(threaded=beside) as weigher:
+            for at, traced in self._stream(rays, dropped, options, packets=packets):
+                if counters:
+                    counted[at] = traced[2]
+                check_ended(traced[1])
+                # On this side, while the devices are at the next rays; `at` is soon that of others.
+                weigher.do(self._weigh, rays, at.copy() if beside else at, traced, found)
         if counters:
             counted[dropped == 1] = self._layout.missed if not self._empty else 0
         counted = counters_of(counted) if counters else None
@@ -357,8 +360,7 @@ class Tracer:
         dropped = np.zeros(len(rays[0]), np.uint8)
         for at, traced in self._stream(rays, dropped, self._options(any_hit=True), packets=packets):
             check_ended(traced[1])
-            there = at >= 0
-            hit[at[there]] = traced[1][there] >= 0
+            mark_hits(at, traced[1], hit)
         return hit
 
     def all_hits(
