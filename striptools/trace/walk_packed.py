@@ -577,3 +577,8 @@ def _used_bytes(low: Array, high: Array) -> Array:
 # box tested again before it is decoded (one by one): 0.96 to 0.98. One by one, axes chosen before decoding:
 # 0.96. The chosen lanes blended by masks: 0.94 in packets. Corners put in their order behind a second cond:
 # 0.97. Each cond costs: indices behind one, words behind another, coordinates behind a third 0.86.
+#
+# Leaves sifted, and decoded again where something may be nearer: occlusion closest 1.04 to 1.08, random rays
+# 1.03 (dragon) and 0.94 (bunny), a camera's rays one by one 0.87 to 0.9, since every other leaf of theirs is
+# hit; any hit 0.97 to 1.0, for which nothing is sifted. The decoded leaf kept for the cond 0.55; only the
+# lanes that may be nearer decoded again, one by one, 0.95 of sifting.
