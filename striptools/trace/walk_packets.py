@@ -414,5 +414,5 @@ def _walk_packet(
 # Ratios of speed to what stands here (dragon, 3.5 M; 72 and 140 ns a ray). Lost or no gain: triangles sifted
 # before all rays are weighed 0.93, 1.0; a leaf's lines touched before its box is tested 0.94, 0.87; triangles
 # not sifted by the frustum where few rays meet the leaf 0.96, 0.98; a leaf's rows read one by one 0.94, 0.95;
-# RAY_OVER_TRIANGLE of 0.3 and 1.2 0.94, 1.0 and 1.0, 0.98; registers of 512 bits 0.97, 1.01. A leaf read where
-# it is tested, in place of a copy of it, gave 1.08, 1.06.
+# RAY_OVER_TRIANGLE of 0.3 and 1.2 0.94, 1.0 and 1.0, 0.98; registers of 512 bits 0.97, 1.01. A leaf read
+# where it is tested, in place of a copy of it, gave 1.08, 1.06.
