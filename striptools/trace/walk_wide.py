@@ -169,8 +169,8 @@ class WideScene(NamedTuple):
 # 10 % and 20 %, and any hit then visits 4 % more.
 #
 # Sifting leaves before hits are weighed (`walk.sifted`; rebuilt; bunny, dragon): occlusion closest 1.18,
-# 1.13, any hit 1.05, 1.02, a camera's rays one by one 1.0, 1.02. With the division left to the cond, but its two
-# numbers kept for it, 1.10; with edge functions alone 0.95; with the straddling of corners too 1.02. The hit
-# of a single lane told without a branch, by sums over lanes, 0.83 to 0.9. The next child found beside the
+# 1.13, any hit 1.05, 1.02, a camera's rays one by one 1.0, 1.02. With the division left to the cond, but its
+# two numbers kept for it, 1.10; with edge functions alone 0.95; with the straddling of corners too 1.02. The
+# hit of a single lane told without a branch, by sums over lanes, 0.83 to 0.9. The next child found beside the
 # leaf's cond, not in it: 0.97. One array for a ray's place 0.93, for both rays' 0.91; all words of a ray and
 # its lane bits as integers 0.93. With one ray side by side now 0.83 to 1.0, with four 0.89.
