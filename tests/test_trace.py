@@ -15,7 +15,7 @@ from strategies import cube, sphere
 from striptools.errors import StriptoolsError, UsageError
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
-from striptools.trace import Tracer
+from striptools.trace import Tracer, walk
 from striptools.trace.launch import EVERY_RAY, _collect, _shared_out, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
@@ -415,6 +415,33 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
     np.testing.assert_array_equal(rows[:count, :FLOATS], device[~none, :FLOATS])
     words = rows.view(np.int32)[:count, FLOATS:]
     np.testing.assert_array_equal(words, device.view(np.int32)[~none, FLOATS:])
+
+
+@pytest.mark.parametrize("lay", [lay_out, lay_out_packed])
+def test_a_ray_that_is_done_stays_so(ball, lay):
+    """Beside one that is not it visits the last node again and again, even where that has children."""
+    arrays = lay(ball).arrays
+    names = [name for name in ("nodes", "planes") if hasattr(arrays, name)]
+    scene = arrays._replace(
+        **{n: np.concatenate([getattr(arrays, n), getattr(arrays, n)[:1]]) for n in names}
+    )
+    origins, directions = rays_at(ball, 64, 3)
+    ready = np.asarray(jax.jit(prepared_rays)(scene, origins, directions, np.full(64, np.inf, "f4")))
+    options = WalkOptions(interleave=1, any_hit=False, counting=False, stack_size=32)
+
+    @jax.jit
+    def visited(scene, row):
+        ray, stack = walk.ReadyRay(row), walk._floor(scene, options)
+        steps = walk._Walk(scene, (ray,), options)
+        state = walk._State((walk._at_bottom(scene),), (stack,), np.int32(0), ())
+        at_root = state._replace(places=(ray.start._replace(child=np.int32(0)),))
+        for _ in range(3):
+            state = steps.visit_nodes(state, (walk.nothing_yet(ray),))
+        return state.places[0].child, steps.visit_nodes(at_root, (walk.nothing_yet(ray),)).places[0].child
+
+    after = np.array([visited(scene, row) for row in ready])
+    assert (after[:, 0] == DONE).all()
+    assert (after[:, 1] != DONE).any()
 
 
 def test_power_of_two_units_change_nothing(ball):

@@ -519,9 +519,9 @@ def _visit_node(
     entry = jnp.stack([place.node, place.lanes])[None]
     stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
     height = jnp.where(place.lanes != 0, place.height + 1, place.height)
-    met = scene.lanes_met(place.child, ray.slab, limit)
+    # No ray is at a leaf, but one may be done: it goes through the motions, and no box is near enough.
+    met = scene.lanes_met(place.child, ray.slab, jnp.where(place.child >= 0, limit, np.float32(-1)))
     lanes = jnp.sum(jnp.where(met, lane_bits_of(ray.octant, scene.width), 0))
-    # A ray that is done goes through the motions, and none is at a leaf.
     return next_child(scene, ray.octant, place.child, lanes, height, stack)[0], stack
 
 
