@@ -16,13 +16,14 @@ from striptools.kernels.rays import (
     ONE,
     ZERO,
     flushed,
-    is_ray,
     larger,
     longest_axis,
     longest_of,
     picked,
-    scaled_by,
+    ray_at,
+    scaled_ray,
     smaller,
+    take_rays,
 )
 
 PACKET = 32
@@ -53,38 +54,13 @@ WIDER = np.float32(2.0**-21)
 FAR = np.float32(3.0e38)
 
 
-@inlined
-def ray_at(which, place):
-    """The ray at a place, of all of them or of those that are said."""
-    return np.int64(which[place]) if len(which) > 0 else place
-
-
-@inlined
-def take(origins, directions, t_max, which, begin, held, room):
-    """Gather `held` rays into a room, and zeros behind them."""
-    for k in range(PACKET):
-        r = ray_at(which, begin + min(k, held - 1))
-        for axis in range(3):
-            room[ORIGIN + axis * PACKET + k] = origins[r, axis]
-            room[WAY + axis * PACKET + k] = directions[r, axis]
-        room[FAR_OF + k] = t_max[r] if k < held else ZERO
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def prepare(room, scale, x, y, z, away):
     """Fill all other rows of a room, for rays whose dominant axis and side are said."""
     for k in range(PACKET):
-        # Scale the ray by powers of two; mark what is no ray, or goes another way.
-        ox = flushed(flushed(room[ORIGIN + k]) * scale)
-        oy = flushed(flushed(room[ORIGIN + PACKET + k]) * scale)
-        oz = flushed(flushed(room[ORIGIN + 2 * PACKET + k]) * scale)
-        dx = flushed(room[WAY + k])
-        dy = flushed(room[WAY + PACKET + k])
-        dz = flushed(room[WAY + 2 * PACKET + k])
-        far = flushed(room[FAR_OF + k])
-        room[VALID + k] = ONE if is_ray(ox, oy, oz, dx, dy, dz, far) else ZERO
-        shorten, length = scaled_by(longest_of(dx, dy, dz))
-        dx, dy, dz = flushed(dx * shorten), flushed(dy * shorten), flushed(dz * shorten)
+        # Scale the ray; mark what is no ray, or goes another way.
+        ox, oy, oz, dx, dy, dz, far, back, valid = scaled_ray(room, ORIGIN, WAY, FAR_OF, PACKET, k, scale)
+        room[VALID + k] = ONE if valid else ZERO
         depth = picked(dx, dy, dz, z)
         same = (longest_axis(dx, dy, dz) == z) & ((depth < ZERO) == away)
         room[SAME + k] = ONE if same else ZERO
@@ -94,8 +70,8 @@ def prepare(room, scale, x, y, z, away):
         room[SLOPE + k] = flushed(picked(dx, dy, dz, x) / depth)
         room[SLOPE + PACKET + k] = flushed(picked(dx, dy, dz, y) / depth)
         room[SLOPE + 2 * PACKET + k] = ONE / depth
-        room[REACH + k] = flushed(flushed(far * length) * scale)
-        room[BACK + k] = flushed(shorten / scale)
+        room[REACH + k] = far
+        room[BACK + k] = back
         room[DEPTH + k] = abs(depth)
         room[LARGEST_OF + k] = longest_of(ox, oy, oz)
 
@@ -130,27 +106,15 @@ def gather_live(room, lane_of):
 
 
 @inlined
-def least(room, row):
-    """The least number of a row."""
+def folded(room, row, join):
+    """The numbers of a row joined pairwise, which are `smaller` or `larger`."""
     for k in range(16):
-        room[FOLD + k] = smaller(room[row + k], room[row + 16 + k])
+        room[FOLD + k] = join(room[row + k], room[row + 16 + k])
     for k in range(8):
-        room[FOLD + k] = smaller(room[FOLD + k], room[FOLD + 8 + k])
+        room[FOLD + k] = join(room[FOLD + k], room[FOLD + 8 + k])
     for k in range(4):
-        room[FOLD + k] = smaller(room[FOLD + k], room[FOLD + 4 + k])
-    return smaller(smaller(room[FOLD], room[FOLD + 1]), smaller(room[FOLD + 2], room[FOLD + 3]))
-
-
-@inlined
-def most(room, row):
-    """The largest number of a row."""
-    for k in range(16):
-        room[FOLD + k] = larger(room[row + k], room[row + 16 + k])
-    for k in range(8):
-        room[FOLD + k] = larger(room[FOLD + k], room[FOLD + 8 + k])
-    for k in range(4):
-        room[FOLD + k] = larger(room[FOLD + k], room[FOLD + 4 + k])
-    return larger(larger(room[FOLD], room[FOLD + 1]), larger(room[FOLD + 2], room[FOLD + 3]))
+        room[FOLD + k] = join(room[FOLD + k], room[FOLD + 4 + k])
+    return join(join(room[FOLD], room[FOLD + 1]), join(room[FOLD + 2], room[FOLD + 3]))
 
 
 @inlined
@@ -231,7 +195,7 @@ def ready_packets(
         x = 0 if z == 2 else z + 1
         y = 0 if x == 2 else x + 1
         away = picked(mx, my, mz, z) < ZERO
-        take(origins, directions, t_max, which, begin, end - begin, room)
+        take_rays(origins, directions, t_max, which, begin, end - begin, room, ORIGIN, WAY, FAR_OF, PACKET)
         prepare(room, scale, x, y, z, away)
         live, same = gather_live(room, lane_of)
         if not same:
@@ -245,12 +209,12 @@ def ready_packets(
             continue
 
         # Bound origins and slopes; along the axis all is counted the way the rays go.
-        s0, s1 = least(room, SLOPE), most(room, SLOPE)
-        u0, u1 = least(room, SLOPE + PACKET), most(room, SLOPE + PACKET)
-        x0, x1 = least(room, START), most(room, START)
-        y0, y1 = least(room, START + PACKET), most(room, START + PACKET)
-        z0, z1 = least(room, START + 2 * PACKET), most(room, START + 2 * PACKET)
-        deepest, largest = most(room, DEPTH), larger(reach, most(room, LARGEST_OF))
+        s0, s1 = folded(room, SLOPE, smaller), folded(room, SLOPE, larger)
+        u0, u1 = folded(room, SLOPE + PACKET, smaller), folded(room, SLOPE + PACKET, larger)
+        x0, x1 = folded(room, START, smaller), folded(room, START, larger)
+        y0, y1 = folded(room, START + PACKET, smaller), folded(room, START + PACKET, larger)
+        z0, z1 = folded(room, START + 2 * PACKET, smaller), folded(room, START + 2 * PACKET, larger)
+        deepest, largest = folded(room, DEPTH, larger), larger(reach, folded(room, LARGEST_OF, larger))
         if away:
             s0, s1, u0, u1, z0, z1 = -s1, -s0, -u1, -u0, -z1, -z0
         low = -root[z + 3] if away else root[z]

@@ -108,33 +108,41 @@ def scaled_by(longest):
     return np.int32((254 - exponent) << 23).view(np.float32), np.int32(exponent << 23).view(np.float32)
 
 
+@inlined
+def scaled_ray(room, start, way, far, size, i, scale):
+    """Scale a ray of a room by powers of two, its rows `size` apart, denormals read and written as zeros.
+
+    Returns:
+        Origin, direction, reach, what gives a t back in the caller's units, and whether it is a ray.
+    """
+    ox = flushed(flushed(room[start + i]) * scale)
+    oy = flushed(flushed(room[start + size + i]) * scale)
+    oz = flushed(flushed(room[start + 2 * size + i]) * scale)
+    dx, dy, dz = flushed(room[way + i]), flushed(room[way + size + i]), flushed(room[way + 2 * size + i])
+    reach = flushed(room[far + i])
+    valid = is_ray(ox, oy, oz, dx, dy, dz, reach)
+    shorten, length = scaled_by(longest_of(dx, dy, dz))
+    dx, dy, dz = flushed(dx * shorten), flushed(dy * shorten), flushed(dz * shorten)
+    reach = flushed(flushed(reach * length) * scale)
+    return ox, oy, oz, dx, dy, dz, reach, flushed(shorten / scale), valid
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def prepare_chunk(room, frame):
     """Prepare a whole chunk: from origins, directions and t_max in their rows to all words but the root's.
 
     Args:
-        room: (1792,) float32; places that hold no ray have zeros.
+        room: (1792,) float32; places that hold no ray have a t_max of zero.
         frame: As of `ready_rays`.
     """
     scale, reach, low, unit, margin_unit = frame
     low_x, low_y, low_z = low[0], low[1], low[2]
     unit_x, unit_y, unit_z = unit[0], unit[1], unit[2]
     for i in range(CHUNK):
-        # Scale the ray by powers of two; mark what is no ray.
-        ox = flushed(flushed(room[START + i]) * scale)
-        oy = flushed(flushed(room[START + CHUNK + i]) * scale)
-        oz = flushed(flushed(room[START + 2 * CHUNK + i]) * scale)
-        dx = flushed(room[WAY + i])
-        dy = flushed(room[WAY + CHUNK + i])
-        dz = flushed(room[WAY + 2 * CHUNK + i])
-        far = flushed(room[REACH + i])
-        room[VALID + i] = ONE if is_ray(ox, oy, oz, dx, dy, dz, far) else ZERO
-        shorten, length = scaled_by(longest_of(dx, dy, dz))
-        dx = flushed(dx * shorten)
-        dy = flushed(dy * shorten)
-        dz = flushed(dz * shorten)
-        room[REACH + i] = flushed(flushed(far * length) * scale)
-        room[REACH + CHUNK + i] = flushed(shorten / scale)
+        ox, oy, oz, dx, dy, dz, far, back, valid = scaled_ray(room, START, WAY, REACH, CHUNK, i, scale)
+        room[VALID + i] = ONE if valid else ZERO
+        room[REACH + i] = far
+        room[REACH + CHUNK + i] = back
 
         # Make the constants of the slab test.
         margin = margin_unit * larger(longest_of(ox, oy, oz), reach)
@@ -216,14 +224,20 @@ def highest_bit(lanes):
 
 
 @inlined
-def take_rays(origins, directions, t_max, which, begin, held, room):
-    """Gather `held` rays into a chunk, and zeros behind them."""
-    for i in range(CHUNK):
-        r = np.int64(which[begin + i]) if len(which) > 0 and i < held else begin + i
+def ray_at(which, place):
+    """The ray at a place, of all of them or of those that are said."""
+    return np.int64(which[place]) if len(which) > 0 else place
+
+
+@inlined
+def take_rays(origins, directions, t_max, which, begin, held, room, start, way, far, size):
+    """Gather `held` rays into a room of `size`, rows as far apart; what is behind reaches nothing."""
+    for i in range(size):
+        r = ray_at(which, begin + min(i, held - 1))
         for axis in range(3):
-            room[START + axis * CHUNK + i] = origins[r, axis] if i < held else ZERO
-            room[WAY + axis * CHUNK + i] = directions[r, axis] if i < held else ZERO
-        room[REACH + i] = t_max[r] if i < held else ZERO
+            room[start + axis * size + i] = origins[r, axis]
+            room[way + axis * size + i] = directions[r, axis]
+        room[far + i] = t_max[r] if i < held else ZERO
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -258,12 +272,12 @@ def ready_rays(
     count, place = 0, begin
     while place < every and count < len(rays):
         held = min(CHUNK, every - place, len(rays) - count)
-        take_rays(origins, directions, t_max, which, place, held, room)
+        take_rays(origins, directions, t_max, which, place, held, room, START, WAY, REACH, CHUNK)
         prepare_chunk(room, frame)
         if visit:
             visit_root(room, root)
         for i in range(held):
-            r = np.int64(which[place + i]) if len(which) > 0 else place + i
+            r = ray_at(which, place + i)
             lanes = bits_of(room[LANES + i])
             child = np.int32(0)
             if room[VALID + i] == ZERO:
