@@ -21,7 +21,7 @@ from striptools.trace.box import Slab
 from striptools.trace.numerics import index
 from striptools.trace.triangle import Corners, Shear, pick
 from striptools.trace.triangle_tests import IN_DOUBLE
-from striptools.trace.walk import Best, Decode, Leaf, WalkOptions, found_any, nearer
+from striptools.trace.walk import Best, Decode, Leaf, WalkOptions, found_in
 from striptools.trace.walk_packed import first_corner
 
 
@@ -111,11 +111,7 @@ class Standing(NamedTuple):
         def placed() -> Leaf:
             return self.leaf_of(shear.axes, where, options.decode)
 
-        leaf = placed()
-        t = leaf.crossings(shear, test=options.test, again=placed)
-        if options.any_hit:
-            return found_any(best, t)
-        return nearer(best, t, leaf.name, self.geometries.faces_of if self.has_faces else None)
+        return found_in(placed, shear, best, options, self.geometries.faces_of if self.has_faces else None)
 
     def residual(self, own: Array, point: Array) -> tuple[Array, Array]:
         """By how much a point of the geometry (3,) stands beside one of the scene, computed in float64.

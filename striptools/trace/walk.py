@@ -567,16 +567,46 @@ def _first_by_face(
     return lax.cond(several | (nearest == best.nearest), by_face, lambda: (least, jnp.bool_(True)))
 
 
-def sifted(
-    at_hand: Callable[[], Leaf], shear: Shear, best: Best, tested: Callable[[], Best], test: TriangleTest
+def found_in(
+    at_hand: Callable[[], Leaf],
+    shear: Shear,
+    best: Best,
+    options: "WalkOptions",
+    faces_of: Callable[[Array], Array] | None = None,
 ) -> Best:
-    """What is `tested` of a leaf, or `best` where none of its triangles can be nearer.
+    """What is found with the triangles of a leaf, against the closest hit so far.
 
-    The default test alone is worth it. `tested` makes the leaf again: what a cond keeps goes through memory.
+    Args:
+        at_hand: Makes the leaf.
+        shear: Of the ray.
+        best: So far.
+        options: By which test, and whether any hit will do.
+        faces_of: As of `nearer`.
     """
-    if test != "watertight":
-        return tested()
-    return lax.cond(any_lane(at_hand().may_cross(shear, best.nearest)), tested, lambda: best)
+    leaf = at_hand()
+    t = leaf.crossings(shear, test=options.test, again=at_hand)
+    return found_any(best, t) if options.any_hit else nearer(best, t, leaf.name, faces_of)
+
+
+def sifted(
+    at_hand: Callable[[], Leaf],
+    shear: Shear,
+    best: Best,
+    options: "WalkOptions",
+    faces_of: Callable[[Array], Array] | None = None,
+) -> Best:
+    """What is `found_in` a leaf, or `best` where none of its triangles can be nearer.
+
+    For rays one by one and the default test: else it is `found_in` alone. The leaf is made twice, as what is
+    kept for a cond goes through memory.
+    """
+
+    def found() -> Best:
+        return found_in(at_hand, shear, best, options, faces_of)
+
+    if options.batch or options.test != "watertight":
+        return found()
+    return lax.cond(any_lane(at_hand().may_cross(shear, best.nearest)), found, lambda: best)
 
 
 def found_any(best: Best, t: Array) -> Best:

@@ -44,7 +44,6 @@ from striptools.trace.walk import (
     WalkOptions,
     WalkScene,
     lane_bits_of,
-    nearer,
     next_child,
     sifted,
 )
@@ -261,7 +260,7 @@ def _test_leaf(
 
     def test_ray(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
-        return left, *_one_ray(scene, packet, at_hand, lane, state[1], state[2])
+        return left, *_one_ray(scene, packet, at_hand, lane, state[1], state[2], options)
 
     def test_triangle(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lane, left = _next_bit(state[0])
@@ -284,16 +283,12 @@ def _one_ray(
     lane: Array,
     t: Array,
     name: Array,
+    options: WalkOptions,
 ) -> tuple[Array, Array]:
     """Test one ray against eight triangles."""
     before = Best(*(lax.dynamic_slice(a, (lane,), (1,))[0] for a in (t, name)))
-    shear = packet.shear_of(lane)
-
-    def tested() -> Best:
-        faces_of, leaf = scene.faces_of if scene.has_faces else None, at_hand()
-        return nearer(before, leaf.crossings(shear), leaf.name, faces_of)
-
-    best = sifted(at_hand, shear, before, tested, "watertight")
+    faces_of = scene.faces_of if scene.has_faces else None
+    best = sifted(at_hand, packet.shear_of(lane), before, options._replace(any_hit=False), faces_of)
     return (
         lax.dynamic_update_slice(t, best.nearest[None], (lane,)),
         lax.dynamic_update_slice(name, best.name[None], (lane,)),

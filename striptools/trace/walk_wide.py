@@ -18,8 +18,6 @@ from striptools.trace.walk import (
     Leaf,
     Traced,
     WalkOptions,
-    found_any,
-    nearer,
     sifted,
     walk_rays,
 )
@@ -84,12 +82,7 @@ class WideScene(NamedTuple):
         def at_hand() -> Leaf:
             return leaf_in(self.blocks, where, shear.axes)
 
-        def tested() -> Best:
-            leaf = at_hand()
-            t = leaf.crossings(shear, test=options.test, again=at_hand)
-            return found_any(best, t) if options.any_hit else nearer(best, t, leaf.name)
-
-        return tested() if options.batch else sifted(at_hand, shear, best, tested, options.test)
+        return sifted(at_hand, shear, best, options)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""
