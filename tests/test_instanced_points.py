@@ -8,7 +8,7 @@ from test_closest_point import BOUND, COLUMNS, distance_to
 from test_hoisting import assert_hoisted
 from test_instanced_queries import placed_corners, tracers
 from test_instances import SCENES, load
-from test_shared_instances import KINDS, mesh_of, random_matrices, sphere
+from test_shared_instances import KINDS, crowded, mesh_of, random_matrices, sphere
 
 from striptools.errors import StriptoolsError
 from striptools.pipeline import convert
@@ -23,11 +23,7 @@ from striptools.trace.walk_points import PointOptions
 @pytest.fixture(scope="module")
 def crowd():
     """Thirty instances of three geometries, one far from its own zero, sheared, mirrored; and the scene."""
-    random = np.random.default_rng(5)
-    parts = [sphere(), sphere(4, 3, (8.0, -5.0, 2.0)), sphere(15, 10)]
-    geometry = np.concatenate([[2, 0, 1], random.integers(0, 3, 27)])
-    mesh = mesh_of(parts, geometry, random_matrices(random, len(geometry)))
-    return mesh, convert(mesh)
+    return crowded(5, 30, sphere(15, 10))
 
 
 def points_of(scene, count, seed=0):

@@ -68,14 +68,19 @@ def mesh_of(parts, geometry, matrix):
     )
 
 
-@pytest.fixture(scope="module")
-def crowd():
-    """A mesh of forty instances of three geometries, one of them far from its own zero, and its scene."""
-    random = np.random.default_rng(3)
-    parts = [sphere(), sphere(4, 3, (8.0, -5.0, 2.0)), sphere(30, 20)]
-    geometry = np.concatenate([[2, 0, 1], random.integers(0, 3, 37)])
+def crowded(seed, count, last):
+    """A mesh of instances of three geometries, one of them far from its own zero, and its scene."""
+    random = np.random.default_rng(seed)
+    parts = [sphere(), sphere(4, 3, (8.0, -5.0, 2.0)), last]
+    geometry = np.concatenate([[2, 0, 1], random.integers(0, 3, count - 3)])
     mesh = mesh_of(parts, geometry, random_matrices(random, len(geometry)))
     return mesh, convert(mesh)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """Forty instances."""
+    return crowded(3, 40, sphere(30, 20))
 
 
 def rays_through(scene, count, seed=0):

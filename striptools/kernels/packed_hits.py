@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from striptools.kernels.bits import bits_set, highest_bit
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.packed_nodes import LOW
@@ -107,22 +108,6 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
             last = last_of[first]
             back = first - last if last >= 0 else first - start_of[first] + turn_of[first]
             described[run] = first | length << 8 | strip_of[first] << 11 | turns << 19 | back << 27
-
-
-@inlined
-def bits_set(number):
-    """How many bits of a number are set: written as LLVM knows it, which makes it one instruction."""
-    n = np.uint64(number)
-    n -= n >> np.uint64(1) & np.uint64(0x5555555555555555)
-    n = (n & np.uint64(0x3333333333333333)) + (n >> np.uint64(2) & np.uint64(0x3333333333333333))
-    n = n + (n >> np.uint64(4)) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64(n * np.uint64(0x0101010101010101) >> np.uint64(56))
-
-
-@inlined
-def highest_bit(number):
-    """The place of the highest bit that is set of a number below 2**32, not zero: a float's exponent."""
-    return (np.float64(number).view(np.int64) >> 52) - 1023
 
 
 @inlined

@@ -10,7 +10,8 @@ Cost: a third of that of one ray after the other.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import helper, inlined
+from striptools.kernels.bits import highest_bit
+from striptools.kernels.compiled import inlined
 from striptools.kernels.wide import BROAD, EMPTY
 
 ROW = 24
@@ -215,12 +216,6 @@ def visit_root(room, root):
 def mirror_of(octant, broad):
     """As `trace.walk.mirror_of`, which a kernel cannot call."""
     return octant << 1 | octant & 1 if broad else octant
-
-
-@helper
-def highest_bit(lanes):
-    """The place of the highest bit of a positive int32 below 2**24: a float32's exponent."""
-    return (np.float32(lanes).view(np.int32) >> 23) - 127
 
 
 @inlined

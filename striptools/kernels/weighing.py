@@ -96,8 +96,10 @@ def weigh_held(room, held, scale, ray_of, turn_of, u, v):
 
 
 @inlined
-def take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of):
-    """Gather rays and corners of hits, step by step, so that one waits for memory while others do."""
+def weigh_from_blocks(
+    origins, directions, face, place, blocks, scale, room, held, ray_of, slot_of, turn_of, u, v
+):
+    """Gather rays and corners of hits, step by step, so that one waits while others do; weigh them."""
     for i in range(held):
         slot_of[i] = place[face[ray_of[i]]]
     # Touch each line of the leaves first: with little else to do, more loads are under way at once.
@@ -115,6 +117,7 @@ def take_corners(origins, directions, face, place, blocks, room, held, ray_of, s
             room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
             room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
         turn_of[i] = slot_of[i] & 3
+    weigh_held(room, held, scale, ray_of, turn_of, u, v)
 
 
 @kernel
@@ -144,6 +147,7 @@ def weigh_hits(
     ray_of = np.zeros(CHUNK, np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
     slot_of = np.zeros(CHUNK, np.int32)
+    gathered = (ray_of, slot_of, turn_of)
     held = 0
     for k in range(len(at)):
         r = at[k]
@@ -161,12 +165,12 @@ def weigh_hits(
             ray_of[held] = r
             held += np.int64(name >= 0)
             if held == CHUNK:
-                take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of)
-                weigh_held(room, held, scale, ray_of, turn_of, u, v)
+                weigh_from_blocks(
+                    origins, directions, face, place, blocks, scale, room, held, *gathered, u, v
+                )
                 held = 0
     if held > 0:
-        take_corners(origins, directions, face, place, blocks, room, held, ray_of, slot_of, turn_of)
-        weigh_held(room, held, scale, ray_of, turn_of, u, v)
+        weigh_from_blocks(origins, directions, face, place, blocks, scale, room, held, *gathered, u, v)
 
 
 @kernel
