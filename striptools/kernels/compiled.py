@@ -9,7 +9,9 @@ return one.
 
 from typing import Any
 
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 _ALL: dict[str, Any] = {"cache": True, "nogil": True, "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = _ALL | {"no_cpython_wrapper": True}
@@ -29,3 +31,20 @@ inlined = njit(**_FRUGAL, forceinline=True)
 
 spliced = njit(inline="always")
 """Called from one place, or tiny: becomes part of its caller before anything is compiled."""
+
+
+@intrinsic
+def fetch(context: Any, array: Any, place: Any) -> Any:
+    """Have the cache line of `array[place]` fetched, of a (n,) array, without waiting for it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        held = context.make_array(signature.args[0])(context, builder, arguments[0])
+        line = builder.bitcast(builder.gep(held.data, [arguments[1]]), ir.IntType(8).as_pointer())
+        word = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [line.type, word, word, word])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [line.type], kind)
+        # To read, kept as near as can be, of data.
+        builder.call(prefetch, [line, word(0), word(3), word(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, place), generate

@@ -3,17 +3,21 @@
 Source: Woop, Benthin & Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013). Hits are gathered 64 at a
 time, in rows of one number each, so that the arithmetic runs over whole registers.
 
-Cost: a third of the time of weighing hits one by one.
+Cost: a third of the time of weighing hits one by one; more than half of it is waiting for leaves, the rays of
+a picture excepted, though each chunk's lines are fetched while the one before is weighed.
 """
 
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import inlined, kernel
-from striptools.kernels.wide import flushed
+from striptools.kernels.compiled import fetch, inlined, kernel, maker
+from striptools.kernels.wide import WIDTH, flushed
 
 CHUNK = 64
 """Hits that are weighed together."""
+
+BLOCK = 10 * WIDTH
+"""Numbers of a leaf block."""
 
 WAY, START, CORNERS, WEIGHTS = 0, 3 * CHUNK, 6 * CHUNK, 15 * CHUNK
 
@@ -96,40 +100,59 @@ def weigh_held(room, held, scale, ray_of, turn_of, u, v):
 
 
 @inlined
-def weigh_from_blocks(
-    origins, directions, face, place, blocks, scale, room, held, ray_of, slot_of, turn_of, u, v
-):
-    """Gather rays and corners of hits, step by step, so that one waits while others do; weigh them."""
-    for i in range(held):
-        slot_of[i] = place[face[ray_of[i]]]
-    # Touch each line of the leaves first: with little else to do, more loads are under way at once.
-    touched = np.float32(0.0)
-    for i in range(held):
-        block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
+def find_slots(place, names, begin, end, slots, numbers):
+    """Find where the triangles hit lie, and have their lines fetched: two rows of a block are one."""
+    for i in range(begin, end):
+        slot = place[names[i]]
+        slots[i] = slot
+        first = (slot >> 5) * BLOCK
         for row in range(0, 10, 2):
-            touched += blocks[block, row, lane]
-    room[0] = touched
-    for i in range(held):
-        kx, ky, kz = take_ray(origins, directions, ray_of[i], room, i)
-        block, lane = slot_of[i] >> 5, (slot_of[i] >> 2) & 7
+            fetch(numbers, first + row * WIDTH)
+
+
+@inlined
+def gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, room, turn_of):
+    """Gather rays and corners of hits."""
+    for i in range(end - begin):
+        kx, ky, kz = take_ray(origins, directions, rays[begin + i], room, i)
+        slot = slots[begin + i]
+        block, lane = slot >> 5, (slot >> 2) & 7
         for j in range(3):
             room[CORNERS + j * CHUNK + i] = blocks[block, 3 * kx + j, lane]
             room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
             room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
-        turn_of[i] = slot_of[i] & 3
-    weigh_held(room, held, scale, ray_of, turn_of, u, v)
+        turn_of[i] = slot & 3
+
+
+@maker
+def note_hits(at, found_t, found_face, triangle_of, t, face, triangle):
+    """Write t, face and triangle of rays that hit something; return these rays and the faces, (h,) int32."""
+    rays, names = np.empty(len(at), np.int32), np.empty(len(at), np.int32)
+    held = 0
+    for k in range(len(at)):
+        # Without a branch, which would go astray: whether a ray hits anything is hard to foresee.
+        rays[held] = k
+        held += np.int64((at[k] >= 0) & (found_face[k] >= 0))
+    for i in range(held):
+        k = rays[i]
+        r, name = at[k], found_face[k]
+        rays[i], names[i] = r, name
+        t[r] = found_t[k]
+        face[r] = name
+        triangle[r] = triangle_of[name] if len(triangle_of) > 0 else name
+    return rays[:held], names[:held]
 
 
 @kernel
 def weigh_hits(
     origins, directions, at, found_t, found_face, place, blocks, scale, triangle_of, t, face, u, v, triangle
 ):
-    """Where on its face each hit lies, from the leaf blocks.
+    """Where on its face each hit lies, from the leaf blocks. Nothing is written of rays that hit nothing.
 
     Args:
         origins: (r, 3) float32.
         directions: (r, 3) float32, not zero where there is a hit.
-        at: (k,) int32, the rays that results are for, negative for none; others are left alone.
+        at: (k,) int32, the rays that results are for, negative for none.
         found_t: (k,) float32, t of each.
         found_face: (k,) int32, the reported face; negative on a miss.
         place: (f,) int32, see `fill_leaf_blocks`.
@@ -140,37 +163,22 @@ def weigh_hits(
         face: (r,) int32, written.
         u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
         v: (r,) float32, written: the weight of its third corner; or (0,).
-        triangle: (r,) int32, written; -1 on a miss.
+        triangle: (r,) int32, written.
     """
-    weighed = len(u) > 0
+    rays, names = note_hits(at, found_t, found_face, triangle_of, t, face, triangle)
+    if len(u) == 0:
+        return
     room = np.zeros(ROOM, np.float32)
-    ray_of = np.zeros(CHUNK, np.int32)
-    turn_of = np.zeros(CHUNK, np.int32)
-    slot_of = np.zeros(CHUNK, np.int32)
-    gathered = (ray_of, slot_of, turn_of)
-    held = 0
-    for k in range(len(at)):
-        r = at[k]
-        if r < 0:
-            continue
-        # Without branches, which would go astray: whether a ray hits anything is hard to foresee.
-        name = found_face[k]
-        t[r] = found_t[k]
-        face[r] = name
-        own = triangle_of[max(name, 0)] if len(triangle_of) > 0 else name
-        triangle[r] = own if name >= 0 else np.int32(-1)
-        if weighed:
-            u[r] = 0.0
-            v[r] = 0.0
-            ray_of[held] = r
-            held += np.int64(name >= 0)
-            if held == CHUNK:
-                weigh_from_blocks(
-                    origins, directions, face, place, blocks, scale, room, held, *gathered, u, v
-                )
-                held = 0
-    if held > 0:
-        weigh_from_blocks(origins, directions, face, place, blocks, scale, room, held, *gathered, u, v)
+    turn_of = np.empty(CHUNK, np.int32)
+    slots = np.empty(len(rays), np.int32)
+    numbers = blocks.reshape(-1)
+    for begin in range(-CHUNK, len(rays), CHUNK):
+        # The lines that the next chunk needs are fetched while this one is weighed.
+        end = min(begin + CHUNK, len(rays))
+        find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, numbers)
+        if begin >= 0:
+            gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, room, turn_of)
+            weigh_held(room, end - begin, scale, rays[begin:end], turn_of, u, v)
 
 
 @kernel
