@@ -33,9 +33,8 @@ spliced = njit(inline="always")
 """Called from one place, or tiny: becomes part of its caller before anything is compiled."""
 
 
-@intrinsic
-def fetch(context: Any, array: Any, place: Any) -> Any:
-    """Have the cache line of `array[place]` fetched, of a (n,) array, without waiting for it."""
+def _fetch(context: Any, array: Any, place: Any) -> Any:
+    """Types and code of `fetch`, as Numba asks for them."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         held = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -48,3 +47,7 @@ def fetch(context: Any, array: Any, place: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, place), generate
+
+
+fetch: Any = intrinsic(_fetch)
+"""`fetch(array, place)` has the cache line of a (n,) array's number fetched, without waiting for it."""

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from striptools.kernels.bits import highest_bit
-from striptools.kernels.compiled import inlined
+from striptools.kernels.compiled import fetch, inlined
 from striptools.kernels.wide import BROAD, EMPTY
 
 ROW = 24
@@ -227,6 +227,11 @@ def ray_at(which, place):
 @inlined
 def take_rays(origins, directions, t_max, which, begin, held, room, start, way, far, size):
     """Gather `held` rays into a room of `size`, rows as far apart; what is behind reaches nothing."""
+    # Of rays in an order of their own the next are fetched while these are made ready.
+    for i in range(begin + held, min(begin + held + size, len(which))):
+        fetch(origins.reshape(-1), 3 * which[i])
+        fetch(directions.reshape(-1), 3 * which[i])
+        fetch(t_max, which[i])
     for i in range(size):
         r = ray_at(which, begin + min(i, held - 1))
         for axis in range(3):
