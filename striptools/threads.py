@@ -1,4 +1,4 @@
-"""Threads over nogil kernels: equal chunks, parts by hash, jobs that give rise to more, and work on the side.
+"""Threads over nogil kernels: equal chunks, parts by hash, jobs that give rise to more, a crew that stays.
 
 None decides anything: the caller's kernels write to disjoint places or return what is joined in order, so
 that results do not depend on the number of threads.
@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 SMALLEST_CHUNK = 1 << 14
 """Rows below which another thread is not worth its start."""
@@ -17,6 +17,7 @@ CHUNKS_A_THREAD = 4
 """So that a thread that is held up does not hold up the others for long."""
 
 Result = TypeVar("Result")
+Thing = TypeVar("Thing")
 
 
 def every_core() -> int:
@@ -25,18 +26,24 @@ def every_core() -> int:
 
 
 def in_chunks(
-    work: Callable[[tuple[int, int]], Result], count: int, threads: int, smallest: int = SMALLEST_CHUNK
+    work: Callable[[tuple[int, int]], Result],
+    count: int,
+    threads: "int | Crew",
+    smallest: int = SMALLEST_CHUNK,
 ) -> list[Result]:
     """Do `work((begin, end))` for chunks that cover `0 .. count`, and give the results in order.
 
     With one thread, or fewer than twice `smallest` rows, it is one chunk in the thread of the caller.
     """
-    chunks = min(threads * CHUNKS_A_THREAD, count // smallest) if threads > 1 else 1
+    size = threads.size if isinstance(threads, Crew) else threads
+    chunks = min(size * CHUNKS_A_THREAD, count // smallest) if size > 1 else 1
     if chunks <= 1:
         return [work((0, count))]
-    bounds = [count * k // chunks for k in range(chunks + 1)]
+    bounds = pairwise([count * k // chunks for k in range(chunks + 1)])
+    if isinstance(threads, Crew):
+        return threads.each(work, bounds)
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, pairwise(bounds)))
+        return list(pool.map(work, bounds))
 
 
 def in_parts(work: Callable[[int, int], Result], count: int, threads: int) -> list[Result]:
@@ -65,37 +72,32 @@ def run_jobs(work: Callable[..., Iterable[Iterable[int]]], first: tuple[int, ...
             pending |= {pool.submit(work, *job) for future in done for job in future.result()}
 
 
-class Beside:
-    """A thread beside the caller's that does one piece of work after the other; leaving waits for the last.
-
-    An exception of a piece is raised by the next call, or on leaving.
+class Crew:
+    """Threads that do the same to several things at once; leaving ends them.
 
     Args:
-        threaded: Without it the caller does each piece at once.
+        size: How many; with one the caller does it all.
     """
 
-    def __init__(self, *, threaded: bool) -> None:
-        self._pool = ThreadPoolExecutor(1) if threaded else None
-        self._begun: Future[None] | None = None
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._pool = ThreadPoolExecutor(size) if size > 1 else None
 
-    def __enter__(self) -> "Beside":
+    def __enter__(self) -> "Crew":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown()
-            if kind is None:
-                self._finish()
 
-    def do(self, work: Callable[..., None], *given: Any) -> None:
-        """Begin a piece, once the one before is done."""
-        if self._pool is None:
-            work(*given)
-            return
-        self._finish()
-        self._begun = self._pool.submit(work, *given)
+    def each(self, work: Callable[[Thing], Result], things: Iterable[Thing]) -> list[Result]:
+        """Do `work(thing)` for each and give the results in order, once all are done.
 
-    def _finish(self) -> None:
-        if self._begun is not None:
-            self._begun.result()
-            self._begun = None
+        An exception of one is raised once all are done: of several that of the first thing.
+        """
+        things = list(things)
+        if self._pool is None or len(things) < 2:
+            return [work(thing) for thing in things]
+        begun = [self._pool.submit(work, thing) for thing in things]
+        wait(begun)
+        return [future.result() for future in begun]

@@ -437,7 +437,8 @@ def test_neither_packets_nor_kernels_walk_by_other_tests(monkeypatch: pytest.Mon
         asked.append((options.test, packets))
         return honest(mesh, options, packets)
 
-    monkeypatch.setattr("striptools.trace.launch.program", noting)
+    for module in ("launch", "streams"):
+        monkeypatch.setattr(f"striptools.trace.{module}.program", noting)
     origins = np.zeros((256, 3), np.float32)
     directions = np.tile(np.array([1, 1, 1], np.float32), (256, 1))
     for test in get_args(TriangleTest):

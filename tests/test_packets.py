@@ -18,8 +18,9 @@ from striptools.mesh.mesh import Mesh
 from striptools.options import Options
 from striptools.trace import Tracer
 from striptools.trace import walk_packets as walk
-from striptools.trace.launch import EVERY_RAY, program
+from striptools.trace.launch import program
 from striptools.trace.rays import Camera, camera_rays
+from striptools.trace.streams import EVERY_RAY
 
 FIELDS = ("t", "face", "u", "v", "triangle")
 RESIDENT = ("expanded", "compressed")

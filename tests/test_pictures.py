@@ -10,7 +10,7 @@ from strategies import sphere
 from striptools.kernels.packets import PACKET
 from striptools.kernels.pictures import COLUMNS, ROWS, row_width, tile_order
 from striptools.mesh.mesh import Mesh
-from striptools.trace import Tracer, launch
+from striptools.trace import Tracer, streams
 from striptools.trace.rays import Camera, camera_rays
 
 SIZES = [(16, 4), (17, 5), (64, 64), (100, 7), (333, 40), (1024, 4)]
@@ -92,14 +92,14 @@ def test_hits_are_the_same_in_any_order(size):
 
 def test_packets_of_a_picture_are_its_tiles(monkeypatch):
     seen = []
-    made = launch.ready_packets
+    made = streams.ready_packets
 
     def spy(*given):
         result = made(*given)
         seen.append(given[-3][: result[0]].copy())
         return result
 
-    monkeypatch.setattr(launch, "ready_packets", spy)
+    monkeypatch.setattr(streams, "ready_packets", spy)
     tracer = Tracer(scene_of(Mesh(*sphere(3))), device="cpu", threads=1)
     tracer.closest_hit(*picture(64, 32))
     lanes = np.concatenate(seen)

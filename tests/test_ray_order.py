@@ -9,7 +9,7 @@ from strategies import sphere
 
 from striptools.kernels.ray_order import BITS, CELLS, sort_rays, start_apart
 from striptools.mesh.mesh import Mesh
-from striptools.trace import Tracer, launch
+from striptools.trace import Tracer, streams
 from striptools.trace.rays import Camera, camera_rays
 
 LOW = np.float32([-1, -2, -3])
@@ -95,9 +95,9 @@ def spied(monkeypatch, run):
         lengths.append(len(order))
         return order
 
-    monkeypatch.setattr(launch, "sort_rays", spy)
-    monkeypatch.setattr(launch, "LEAST_SORTED", 0)
-    monkeypatch.setattr(launch, "SORTED", run)
+    monkeypatch.setattr(streams, "sort_rays", spy)
+    monkeypatch.setattr(streams, "LEAST_SORTED", 0)
+    monkeypatch.setattr(streams, "SORTED", run)
     return lengths
 
 
@@ -142,5 +142,5 @@ def test_counters_and_packets_that_part_are_the_same(ball, monkeypatch):
 
 def test_small_scenes_are_traced_in_the_order_given(ball, monkeypatch):
     origins, directions, _ = rays_at(ball)
-    monkeypatch.setattr(launch, "sort_rays", None)
+    monkeypatch.setattr(streams, "sort_rays", None)
     Tracer(ball, device="cpu").closest_hit(origins, directions)

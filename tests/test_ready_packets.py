@@ -10,7 +10,7 @@ from strategies import sphere
 from striptools.kernels.packets import FAR, HEAD, PACKET, ROW, ready_packets
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer
-from striptools.trace.launch import EVERY_RAY
+from striptools.trace.streams import EVERY_RAY
 
 KINDS = ("camera", "parallel", "light", "surface", "aimed", "broken", "scattered")
 

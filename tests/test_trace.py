@@ -16,9 +16,10 @@ from striptools.errors import StriptoolsError, UsageError
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer, walk
-from striptools.trace.launch import EVERY_RAY, _collect, _shared_out, _spread, tiles
+from striptools.trace.launch import _collect, _spread, tiles
 from striptools.trace.leaves import aligned_full, lay_out, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
+from striptools.trace.streams import EVERY_RAY
 from striptools.trace.walk import DONE, FLOATS, WalkOptions, prepared_rays, trace_rays
 
 LOWEST = np.finfo(np.float32).min
@@ -539,14 +540,6 @@ def test_spreading_and_collecting_give_the_rays_back(count, devices):
     spread = _spread(rays, devices, room)
     _, (back,) = _collect(slice(10, 10 + count), room, [spread], devices)
     np.testing.assert_array_equal(back, rays)
-
-
-@given(st.integers(1, 64), st.sampled_from([1, 2, 3, 5]), st.integers(0, 4))
-def test_rows_are_shared_out_where_they_lie(live, devices, spare):
-    room = -(-live // devices) + spare
-    rows = np.random.default_rng(live).random((devices * room + 7, 3), np.float32) + 1
-    expected = _spread(rows[:live], devices, room)
-    np.testing.assert_array_equal(_shared_out(rows, live, devices, room), expected)
 
 
 @pytest.mark.parametrize(

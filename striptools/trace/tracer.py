@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Int32
 from striptools.errors import UsageError
 from striptools.kernels.weighing import mark_hits
 from striptools.kernels.wide import BROAD, WIDTH
-from striptools.threads import Beside, in_chunks
+from striptools.threads import Crew, in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
@@ -23,11 +23,12 @@ from striptools.trace.device import DeviceKind, core_count, quiet_jax, trace_dev
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.instanced import InstancedLayout, InstanceNumbers, lay_out_instanced
-from striptools.trace.launch import TILES, device_mesh, replicate, stream, stream_ready
+from striptools.trace.launch import device_mesh, replicate, stream
 from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import WideLayout, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
+from striptools.trace.streams import stream_ready
 from striptools.trace.walk import MISS, WalkOptions
 from striptools.trace.walk_gather import GatherKind
 from striptools.trace.walk_packed import PackedScene
@@ -38,6 +39,9 @@ from striptools.types import TriangleTest
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
+
+MANY = 2**14
+"""Rays for which it is worth while to start threads on this side."""
 
 HierarchyKind = Literal["stored", "rebuilt"]
 ResidentKind = Literal["auto", "expanded", "compressed"]
@@ -192,7 +196,7 @@ class Tracer:
         devices = trace_devices(device, threads)
         self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
-        self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
+        self._hands = (threads or core_count(os.environ)) if self._on_gpu else len(devices)
         return devices
 
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
@@ -291,29 +295,33 @@ class Tracer:
         counted = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
         options = self._options(counting=counters)
-        beside = self._mesh.size > 1 and count > TILES[-1]
-        with Beside(threaded=beside) as weigher:
-            for at, traced in self._stream(rays, dropped, options, packets=packets):
+        with self._crew(count) as crew:
+            for at, traced in self._stream(rays, dropped, options, crew, packets=packets):
                 if counters:
                     counted[at] = traced[2]
                 check_ended(traced[1])
-                # On this side, while the devices are at the next rays; `at` is soon that of others.
-                weigher.do(self._weigh, rays, at.copy() if beside else at, traced, found)
+                self._weigh(rays, at, traced, found, crew)
         if counters:
             counted[dropped == 1] = self._layout.missed if not self._empty else 0
         counted = counters_of(counted) if counters else None
         told = (t, face, u, v, triangle) if weights else (t, face, None, None, triangle)
         return Hits(*told, counted, *_instances_of(self._numbers, face, triangle))
 
-    def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
-        """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
+    def _crew(self, count: int) -> Crew:
+        """Who makes so many rays ready, and weighs hits: a thread a device, beside a GPU one a core."""
+        return Crew(self._hands if count >= MANY else 1)
+
+    def _weigh(
+        self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found, crew: Crew
+    ) -> None:
+        """Fill in what was found of the rays `at`."""
 
         def weigh(part: tuple[int, int]) -> None:
             mine = slice(*part)
             mine_traced = tuple(a[mine] if len(a) == len(at) else a for a in traced)
             self._weighed(rays, at[mine], mine_traced, found)
 
-        in_chunks(weigh, len(at), self._weighers)
+        in_chunks(weigh, len(at), crew)
 
     def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`, weights by the precision of the test."""
@@ -327,7 +335,13 @@ class Tracer:
             weights_inside(at, found)
 
     def _stream(
-        self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, *, packets: bool = False
+        self,
+        rays: Rays,
+        dropped: np.ndarray,
+        options: WalkOptions | None,
+        crew: Crew,
+        *,
+        packets: bool = False,
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         """Trace rays; yield which ones are done, int32, and their results."""
         if options is None:
@@ -341,7 +355,7 @@ class Tracer:
             given = (self._scene, self._layout, rays, dropped, self._mesh, options)
             plain = not options.counting and options.test == "watertight"
             in_packets = packets and plain and self._layout.seen_by_packets is not None
-            yield from stream_ready(*given, in_packets)
+            yield from stream_ready(*given, in_packets, crew)
             return
         for part, traced in stream(self._scene, rays, self._mesh, options):
             yield np.arange(part.start, part.stop, dtype=np.int32), traced
@@ -358,9 +372,10 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        for at, traced in self._stream(rays, dropped, self._options(any_hit=True), packets=packets):
-            check_ended(traced[1])
-            mark_hits(at, traced[1], hit)
+        with self._crew(len(hit)) as crew:
+            for at, traced in self._stream(rays, dropped, self._options(any_hit=True), crew, packets=packets):
+                check_ended(traced[1])
+                mark_hits(at, traced[1], hit)
         return hit
 
     def all_hits(
@@ -508,7 +523,8 @@ class Tracer:
         self, rays: Rays, kind: GatherKind, most: int
     ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
         dropped = np.zeros(len(rays[0]), np.uint8)
-        return self._stream(rays, dropped, self._options(gather=kind, most=most))
+        with self._crew(len(dropped)) as crew:
+            yield from self._stream(rays, dropped, self._options(gather=kind, most=most), crew)
 
     def _options(
         self,

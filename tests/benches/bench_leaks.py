@@ -51,8 +51,8 @@ from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.hit import Hits
 from striptools.trace.instanced import lay_out_instanced
-from striptools.trace.launch import EVERY_RAY
 from striptools.trace.leaves import lay_out
+from striptools.trace.streams import EVERY_RAY
 from striptools.types import TriangleTest
 
 BENCH = {"takes": "paths", "full": [[]], "quick": []}
