@@ -50,4 +50,7 @@ def _fetch(context: Any, array: Any, place: Any) -> Any:
 
 
 fetch: Any = intrinsic(_fetch)
-"""`fetch(array, place)` has the cache line of a (n,) array's number fetched, without waiting for it."""
+"""`fetch(array, place)` has a number's cache line fetched, without waiting for it.
+
+The array is contiguous; places are counted as if it had one axis.
+"""

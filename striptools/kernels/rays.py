@@ -227,11 +227,13 @@ def ray_at(which, place):
 @inlined
 def take_rays(origins, directions, t_max, which, begin, held, room, start, way, far, size):
     """Gather `held` rays into a room of `size`, rows as far apart; what is behind reaches nothing."""
-    # Of rays in an order of their own the next are fetched while these are made ready.
-    for i in range(begin + held, min(begin + held + size, len(which))):
-        fetch(origins.reshape(-1), 3 * which[i])
-        fetch(directions.reshape(-1), 3 * which[i])
-        fetch(t_max, which[i])
+    # Of rays here and there the next are fetched while these are made ready.
+    end = begin + held
+    if end < len(which) and which[end] != which[end - 1] + 1:
+        for i in range(end, min(end + size, len(which))):
+            fetch(origins, 3 * which[i])
+            fetch(directions, 3 * which[i])
+            fetch(t_max, which[i])
     for i in range(size):
         r = ray_at(which, begin + min(i, held - 1))
         for axis in range(3):

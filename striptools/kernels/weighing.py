@@ -100,14 +100,14 @@ def weigh_held(room, held, scale, ray_of, turn_of, u, v):
 
 
 @inlined
-def find_slots(place, names, begin, end, slots, numbers):
+def find_slots(place, names, begin, end, slots, blocks):
     """Find where the triangles hit lie, and have their lines fetched: two rows of a block are one."""
     for i in range(begin, end):
         slot = place[names[i]]
         slots[i] = slot
         first = (slot >> 5) * BLOCK
         for row in range(0, 10, 2):
-            fetch(numbers, first + row * WIDTH)
+            fetch(blocks, first + row * WIDTH)
 
 
 @inlined
@@ -171,11 +171,10 @@ def weigh_hits(
     room = np.zeros(ROOM, np.float32)
     turn_of = np.empty(CHUNK, np.int32)
     slots = np.empty(len(rays), np.int32)
-    numbers = blocks.reshape(-1)
     for begin in range(-CHUNK, len(rays), CHUNK):
         # The lines that the next chunk needs are fetched while this one is weighed.
         end = min(begin + CHUNK, len(rays))
-        find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, numbers)
+        find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, blocks)
         if begin >= 0:
             gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, room, turn_of)
             weigh_held(room, end - begin, scale, rays[begin:end], turn_of, u, v)

@@ -47,7 +47,7 @@ def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
         return jax.device_put(scene, NamedSharding(mesh, EVERYWHERE))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     """The jitted function from a scene and rays to `Traced`, the rays split over the devices.
 

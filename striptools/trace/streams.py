@@ -1,13 +1,14 @@
 """Rays that this side makes ready, streamed through CPU devices: a core for each share of them.
 
-Every step is done by all cores at once: each makes rays of its own ready, walks them, and weighs hits. The
-devices walk one program together, and it ends when the last of them does; so rays are dealt out in small
-blocks, turn by turn, that all have like work.
+Rays are dealt out to the devices in small blocks, turn by turn, so that all have like work. A thread for each
+device makes its rays ready, has them walked, and takes what was found: none waits for another. One program
+for all devices would be as good a way to share out the walk, but it ends when the last of them does, and
+work on this side makes one of them late: two cores were busy 1.6 to 1.7 times as much as one so.
 """
 
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from threading import Event
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.threads import Crew
 from striptools.trace.device import quiet_jax
-from striptools.trace.launch import RAYS, TILES, program
+from striptools.trace.launch import RAYS, TILES, device_mesh, program
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import aligned_zeros
 from striptools.trace.triangle_tests import wants_way
@@ -30,14 +31,14 @@ from striptools.trace.walk import WalkOptions, WalkScene
 PACKET_TILES = (2**3, 2**7, 2**11)
 """Packets that a device takes at once."""
 
-BLOCKS = (PACKET, 2**10)
-"""Rays of a block that is dealt out, at least and at most: whole packets."""
+MANY = 2**13
+"""Rays for each device for which it is worth while to start a thread: fewer go through the first alone."""
 
-TURNS = 8
-"""How often each device is dealt a block, at least, where blocks can be as small."""
+BLOCK = 2**10
+"""Rays of a block that is dealt out: whole packets."""
 
 IN_FLIGHT = 2
-"""Tiles that devices work on or wait for: more only push each other's rays out of the cache."""
+"""Tiles that a device works on or waits for: more only push each other's rays out of the cache."""
 
 LEAST_SORTED = 2**24
 """Bytes of a scene for which rays are sorted: one in a core's own caches is read as fast in any order."""
@@ -47,141 +48,162 @@ SORTED = 2**19
 
 EVERY_RAY = np.zeros(0, np.int32)
 
-Traced = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
-"""Which rays are done, int32, -1 for none, and their results, as of `walk.Traced`."""
+Take = Callable[[np.ndarray, tuple[np.ndarray, ...]], None]
+"""Takes what was found: which rays, int32, -1 for none, and their results as of `walk.Traced`, to be used at
+once. Threads call it side by side, each of rays of its own."""
 
 
-def stream_ready(
-    scene: WalkScene,
+class Station(NamedTuple):
+    """A device, and the scene on it."""
+
+    mesh: Mesh
+    scene: WalkScene
+
+
+def stations_of(scene: WalkScene, mesh: Mesh) -> list[Station]:
+    """Each device of a mesh on its own, where the scene is on all of them."""
+
+    def on(device: jax.Device) -> WalkScene:
+        def mine(array: jax.Array) -> jax.Array:
+            return next(shard.data for shard in array.addressable_shards if shard.device == device)
+
+        return jax.tree.map(mine, scene)
+
+    return [Station(device_mesh([device]), on(device)) for device in mesh.devices.flat]
+
+
+def trace_ready(
+    stations: list[Station],
     layout: Layout,
     rays: Rays,
     dropped: np.ndarray,
-    mesh: Mesh,
     options: WalkOptions,
     packets: bool,
-    crew: Crew,
-) -> Traced:
+    take: Take,
+) -> None:
     """Make rays ready on this side, and trace those that meet the scene: in packets, or each on its own.
 
     Args:
-        scene: On the devices.
-        layout: The same on this side.
+        stations: The CPU devices.
+        layout: The scene on this side.
         rays: Origins, directions and t_max.
         dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
-        mesh: The CPU devices.
         options: What to compile in.
         packets: Put rays that go the same way into packets: of those of a picture, tile by tile.
-        crew: Who makes rays ready.
-
-    Yields:
-        Which rays these are, int32, -1 for none, and their results: to be used before the next.
+        take: Takes what was found.
     """
     count = len(rays[0])
-    words = ROW + 3 * wants_way(options.test)
-    single = _Pipe(scene, mesh, options, TILES, (count, words), ())
-    if not packets:
-        yield from _send_each(single, layout, rays, EVERY_RAY, dropped, crew)
+    width = row_width(*rays[:2]) if packets else 0
+    order = tile_order(count, width) if width else EVERY_RAY
+    hands = stations[: max(1, min(len(stations), count // MANY))]
+    stopped = Event()
+
+    def trace(hand: int) -> None:
+        which = deal(order, count, hand, len(hands), BLOCK) if len(hands) > 1 else order
+        course = _Course(hands[hand], layout, rays, which, dropped, options)
+        try:
+            for found in course.packets() if packets else course.singles():
+                if stopped.is_set():
+                    return
+                take(*found)
+        except BaseException:
+            stopped.set()
+            raise
+
+    with quiet_jax(), Crew(len(hands)) as crew:
+        try:
+            crew.each(trace, range(len(hands)))
+        finally:
+            # Where this thread is interrupted, the others end with the tiles that they are at.
+            stopped.set()
+
+
+Found = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
+"""What a `Take` takes."""
+
+
+class _Course(NamedTuple):
+    """The way of rays through one device.
+
+    Attributes:
+        station: The device.
+        layout: The scene on this side.
+        rays: All there are.
+        which: Those that go this way, in this order, int32; (0,) for all of them.
+        dropped: As of `trace_ready`, and so is what follows.
+        options: What to compile in.
+    """
+
+    station: Station
+    layout: Layout
+    rays: Rays
+    which: np.ndarray
+    dropped: np.ndarray
+    options: WalkOptions
+
+    @property
+    def total(self) -> int:
+        """How many rays go this way."""
+        return len(self.which) or len(self.rays[0])
+
+    def singles(self) -> Found:
+        """Trace each ray on its own."""
+        pipe = self._single_pipe()
+        yield from self._send_each(pipe, self.which)
+        yield from pipe.drain()
+
+    def packets(self) -> Found:
+        """Trace rays in packets, those that go the same way."""
+        single = self._single_pipe()
+        shape = (-(-self.total // PACKET), PACKET_ROW)
+        packed = _Pipe(self.station, self.options, PACKET_TILES, shape, (PACKET,))
+        alone = np.zeros(min(TILES[-1], self.total) + PACKET, np.int32)
+        seen, begin = self.layout.seen_by_packets, 0
+        assert seen is not None
+        given = (seen.frame, seen.box, seen.density)
+        while begin < self.total:
+            rows, at = packed.room()
+            places = (rows, rows.view(np.int32), at, alone, self.dropped)
+            live, left, begin = ready_packets(*self.rays, self.which, begin, *given, *places)
+            yield from packed.fill(live)
+            if left:
+                yield from self._send_each(single, alone[:left])
+        yield from packed.drain()
         yield from single.drain()
-        return
-    packed = _Pipe(scene, mesh, options, PACKET_TILES, (-(-count // PACKET), PACKET_ROW), (PACKET,))
-    for alone in _send_packets(packed, layout, rays, dropped, crew):
-        yield from packed.results()
-        if len(alone):
-            yield from _send_each(single, layout, rays, alone, dropped, crew)
-    yield from packed.drain()
-    yield from single.drain()
+
+    def _single_pipe(self) -> "_Pipe":
+        words = ROW + 3 * wants_way(self.options.test)
+        return _Pipe(self.station, self.options, TILES, (self.total, words), ())
+
+    def _send_each(self, pipe: "_Pipe", which: np.ndarray) -> Found:
+        """Send rays, each on its own."""
+        seen = (tuple(self.layout.arrays.frame), *self.layout.root)
+        for part in self._in_order(which):
+            begin, count = 0, len(part) or len(self.rays[0])
+            while begin < count:
+                rows, at = pipe.room()
+                places = (rows, rows.view(np.int32), at, self.dropped)
+                live, begin = ready_rays(*self.rays, part, begin, *seen, True, *places)
+                yield from pipe.fill(live)
+
+    def _in_order(self, which: np.ndarray) -> Iterator[np.ndarray]:
+        """Rays as they come; where most jump about in a large scene, sorted, so that neighbours go alike."""
+        low, finer = cells_of(self.layout)
+        if self.layout.nbytes < LEAST_SORTED or not start_apart(self.rays[0], which, finer):
+            yield which
+            return
+        count = len(which) or len(self.rays[0])
+        for first in range(0, count, SORTED):
+            yield sort_rays(*self.rays[:2], which, first, min(first + SORTED, count), low, finer)
 
 
-def _send_packets(
-    pipe: "_Pipe", layout: Layout, rays: Rays, dropped: np.ndarray, crew: Crew
-) -> Iterator[np.ndarray]:
-    """Send packets; yield now and then the rays, int32, that are to go each on its own."""
-    seen = layout.seen_by_packets
-    assert seen is not None
-    count, devices = len(rays[0]), pipe.devices
-    width = row_width(*rays[:2])
-    hands = _dealt(tile_order(count, width) if width else EVERY_RAY, count, devices, crew)
-    # A packet more than is ever full.
-    room = min(TILES[-1], max(hand.count for hand in hands)) + PACKET
-    single = np.zeros((devices, room), np.int32)
-
-    def fill(device: int) -> int:
-        hand, (rows, at) = hands[device], rooms[device]
-        given = (*rays, hand.which, hand.begin, seen.frame, seen.box, seen.density)
-        places = (rows, rows.view(np.int32), at, single[device], dropped)
-        live[device], left, hand.begin = ready_packets(*given, *places)
-        return left
-
-    while waiting := [device for device in range(devices) if hands[device].left]:
-        rooms, live = pipe.rooms(), [0] * devices
-        left = crew.each(fill, waiting)
-        pipe.fill(live)
-        yield np.concatenate([single[device, :some] for device, some in zip(waiting, left, strict=True)])
-
-
-def _send_each(
-    pipe: "_Pipe", layout: Layout, rays: Rays, which: np.ndarray, dropped: np.ndarray, crew: Crew
-) -> Traced:
-    """Send rays, each on its own."""
-    seen = (tuple(layout.arrays.frame), *layout.root)
-
-    def fill(device: int) -> None:
-        hand, (rows, at) = hands[device], rooms[device]
-        given = (*rays, hand.which, hand.begin, *seen, True, rows, rows.view(np.int32), at, dropped)
-        live[device], hand.begin = ready_rays(*given)
-
-    for part in _in_order(layout, rays, which):
-        hands = _dealt(part, len(part) or len(rays[0]), pipe.devices, crew)
-        while waiting := [device for device, hand in enumerate(hands) if hand.left]:
-            rooms, live = pipe.rooms(), [0] * pipe.devices
-            crew.each(fill, waiting)
-            pipe.fill(live)
-            yield from pipe.results()
-
-
-def _in_order(layout: Layout, rays: Rays, which: np.ndarray) -> Iterator[np.ndarray]:
-    """Rays as they come; or where most jump about in a large scene, sorted, so that neighbours go alike."""
-    low, finer = _cells_of(layout)
-    if layout.nbytes < LEAST_SORTED or not start_apart(rays[0], which, finer):
-        yield which
-        return
-    count = len(which) or len(rays[0])
-    for first in range(0, count, SORTED):
-        yield sort_rays(*rays[:2], which, first, min(first + SORTED, count), low, finer)
-
-
-def _cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
+def cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
     """Where the cells begin that rays are sorted by, and how many there are in a unit of length."""
     frame, box = layout.arrays.frame, layout.root[0]
     corners = np.stack([np.nanmin(box[:3], axis=1), np.nanmax(box[3:6], axis=1)]).astype(np.float64)
     low, high = (corners * frame.unit + frame.low) / frame.scale
     extent = max((high - low).max(), CELLS * np.finfo(np.float32).tiny)
     return low.astype(np.float32), np.float32(CELLS / extent)
-
-
-@dataclass
-class _Hand:
-    """The rays that a device is dealt: int32, (0,) for all there are; how many; and the first not taken."""
-
-    which: np.ndarray
-    count: int
-    begin: int = 0
-
-    @property
-    def left(self) -> bool:
-        """Whether there are any that were not taken."""
-        return self.begin < self.count
-
-
-def _dealt(which: np.ndarray, count: int, devices: int, crew: Crew) -> list[_Hand]:
-    """Deal rays out, in blocks, turn by turn."""
-    if devices == 1:
-        return [_Hand(which, count)]
-    block = BLOCKS[0]
-    while block < BLOCKS[1] and 2 * block * devices * TURNS <= count:
-        block *= 2
-    dealt = crew.each(lambda device: deal(which, count, device, devices, block), range(devices))
-    return [_Hand(hand, len(hand)) for hand in dealt]
 
 
 class _Buffers(NamedTuple):
@@ -191,115 +213,77 @@ class _Buffers(NamedTuple):
     at: np.ndarray
 
 
-class _Tile(NamedTuple):
-    """A tile on its way: how many rows each device has, of how many places, in which buffers; and results."""
-
-    live: list[int]
-    places: int
-    buffers: _Buffers
-    traced: Any
-
-
 class _Pipe:
-    """Rows on their way through the devices; results come in the order that rows were sent in.
+    """Rows on their way through a device; results come in the order that rows were sent in.
 
     Args:
-        scene: On the devices.
-        mesh: The devices.
+        station: The device.
         options: What to compile in.
-        sizes: Rows that a device takes at once.
+        sizes: Rows that the device takes at once.
         shape: Rows there are to be sent at the most, and words of a row.
         lanes: Rays of a row: () for one, or (32,).
     """
 
     def __init__(
         self,
-        scene: WalkScene,
-        mesh: Mesh,
+        station: Station,
         options: WalkOptions,
         sizes: tuple[int, ...],
         shape: tuple[int, int],
         lanes: tuple[int, ...],
     ) -> None:
-        self.devices = mesh.size
-        self._scene, self._sizes, self._lanes = scene, sizes, lanes
-        self._compiled = program(mesh, options, bool(lanes))
-        self._split = NamedSharding(mesh, RAYS)
-        most = -(-shape[0] // mesh.size) + (BLOCKS[1] if mesh.size > 1 else 0)
-        self._room = next((size for size in sizes if size >= most), sizes[-1])
-        self._words = shape[1]
+        self._scene, self._sizes, self._lanes = station.scene, sizes, lanes
+        self._compiled = program(station.mesh, options, bool(lanes))
+        self._place = NamedSharding(station.mesh, RAYS)
+        self._shape = next((size for size in sizes if size >= shape[0]), sizes[-1]), shape[1]
         self._spare: list[_Buffers] = []
         self._filling: _Buffers | None = None
-        self._filled = [0] * mesh.size
-        self._waiting: deque[_Tile] = deque()
+        self._filled = 0
+        self._waiting: deque[tuple[int, Any, _Buffers]] = deque()
 
-    def rooms(self) -> list[_Buffers]:
-        """Of each device the places that are not filled yet."""
+    def room(self) -> _Buffers:
+        """The places that are not filled yet."""
         if self._filling is None:
             self._filling = self._spare.pop() if self._spare else self._new()
-        buffers, ends = self._filling, range(self._room, (self.devices + 1) * self._room, self._room)
-        places = [slice(end - self._room + full, end) for end, full in zip(ends, self._filled, strict=True)]
-        return [_Buffers(buffers.rows[place], buffers.at[place]) for place in places]
+        return _Buffers(self._filling.rows[self._filled :], self._filling.at[self._filled :])
 
-    def fill(self, live: list[int]) -> None:
-        """Take the first so many places of each device as filled; send all once those of one are full."""
-        self._filled = [before + more for before, more in zip(self._filled, live, strict=True)]
-        if max(self._filled) == self._room:
-            self._send()
+    def fill(self, live: int) -> Found:
+        """Take the first `live` of them as filled; send all once they are, and yield what is done."""
+        self._filled += live
+        if self._filling is not None and self._filled == len(self._filling.rows):
+            yield from self._send()
 
-    def results(self) -> Traced:
-        """Yield what more tiles than may be on their way have found."""
-        while len(self._waiting) >= IN_FLIGHT:
-            yield self._collect()
-
-    def drain(self) -> Traced:
+    def drain(self) -> Found:
         """Send what is left, and yield all that is on its way."""
-        if any(self._filled):
-            self._send()
+        if self._filled:
+            yield from self._send()
         while self._waiting:
             yield self._collect()
 
     def _new(self) -> _Buffers:
-        rows = aligned_zeros((self.devices * self._room, self._words), np.float32)
+        rows = aligned_zeros(self._shape, np.float32)
         return _Buffers(rows, np.zeros((len(rows), *self._lanes), np.int32))
 
-    def _send(self) -> None:
+    def _send(self) -> Found:
         buffers, live = self._filling, self._filled
         assert buffers is not None
-        self._filling, self._filled = None, [0] * self.devices
-        places = next(size for size in self._sizes if size >= max(live))
-        rows = moved_together(buffers.rows, live, self._room, places)
-        moved_together(buffers.at, live, self._room, places)
-        for device, some in enumerate(live):
-            # Rows of zeros end at once.
-            rows[device * places + some : (device + 1) * places] = 0
-        with quiet_jax():
-            traced = self._compiled(self._scene, jax.device_put(rows, self._split))
-        self._waiting.append(_Tile(live, places, buffers, traced))
+        self._filling, self._filled = None, 0
+        rows = buffers.rows[: next(size for size in self._sizes if size >= live)]
+        # Rows of zeros end at once.
+        rows[live:] = 0
+        traced = self._compiled(self._scene, jax.device_put(rows, self._place))
+        self._waiting.append((live, traced, buffers))
+        if len(self._waiting) >= IN_FLIGHT:
+            yield self._collect()
 
     def _collect(self) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        live, places, buffers, traced = self._waiting.popleft()
-        results = tuple(kept(np.asarray(values), live, places) for values in traced)
-        at = kept(buffers.at[: places * self.devices], live, places).reshape(-1)
+        live, traced, buffers = self._waiting.popleft()
+        results = tuple(np.asarray(values)[:live] for values in traced)
         # Results are there, so nobody reads these rays any more.
         self._spare.append(buffers)
-        return at, tuple(values.reshape(-1) for values in results) if self._lanes else results
-
-
-def kept(values: np.ndarray, live: list[int], places: int) -> np.ndarray:
-    """What there is of the rows of each device, which are `places` apart; of nothing nothing."""
-    if len(values) == 0 or min(live) == places:
-        return values
-    parts = [values[k * places : k * places + some] for k, some in enumerate(live)]
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def moved_together(rows: np.ndarray, live: list[int], room: int, places: int) -> np.ndarray:
-    """Rows of all devices, each device's `room` apart, moved where they lie to be `places` apart."""
-    if places < room:
-        for device, some in enumerate(live):
-            rows[device * places : device * places + some] = rows[device * room : device * room + some]
-    return rows[: len(live) * places]
+        if self._lanes:
+            results = tuple(values.reshape(-1) for values in results)
+        return buffers.at[:live].reshape(-1), results
 
 
 # Notes

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Int32
 from striptools.errors import UsageError
 from striptools.kernels.weighing import mark_hits
 from striptools.kernels.wide import BROAD, WIDTH
-from striptools.threads import Crew, in_chunks
+from striptools.threads import in_chunks
 from striptools.trace.alternatives import lay_out_alternative
 from striptools.trace.closest import closest_points, nothing_closest
 from striptools.trace.containment import ContainKind, rays_from, winding_numbers
@@ -28,7 +28,7 @@ from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import WideLayout, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
 from striptools.trace.packed import lay_out_packed
-from striptools.trace.streams import stream_ready
+from striptools.trace.streams import Station, Take, stations_of, trace_ready
 from striptools.trace.walk import MISS, WalkOptions
 from striptools.trace.walk_gather import GatherKind
 from striptools.trace.walk_packed import PackedScene
@@ -39,9 +39,6 @@ from striptools.types import TriangleTest
 
 if TYPE_CHECKING:
     from striptools.reducem.scene import Scene
-
-MANY = 2**14
-"""Rays for which it is worth while to start threads on this side."""
 
 HierarchyKind = Literal["stored", "rebuilt"]
 ResidentKind = Literal["auto", "expanded", "compressed"]
@@ -196,7 +193,7 @@ class Tracer:
         devices = trace_devices(device, threads)
         self._on_gpu = self._kernel = devices[0].platform != "cpu"
         self._mesh = device_mesh(devices)
-        self._hands = (threads or core_count(os.environ)) if self._on_gpu else len(devices)
+        self._weighers = (threads or core_count(os.environ)) if self._on_gpu else 1
         return devices
 
     def _laid_out(self, scene: "Scene", hierarchy: HierarchyKind, threads: int) -> Layout:
@@ -223,7 +220,8 @@ class Tracer:
     def _take(self, layout: Layout) -> None:
         self._layout: Layout = layout
         self._scene: Any = replicate(layout.arrays, self._mesh)
-        self.__dict__.pop("_standing", None)
+        for name in ("_standing", "_stations"):
+            self.__dict__.pop(name, None)
         self._stack_size = max(16, 2 ** math.ceil(math.log2(layout.depth + 2)))
 
     @cached_property
@@ -292,36 +290,32 @@ class Tracer:
         t, (u, v) = np.full(count, np.inf, np.float32), np.zeros((2, count if weights else 0), np.float32)
         face, triangle = np.full(count, MISS), np.full(count, MISS)
         dropped = np.zeros(count, np.uint8)
-        counted = np.zeros((count if counters else 0, KINDS), np.int32)
+        visits = np.zeros((count if counters else 0, KINDS), np.int32)
         found = (t, face, u, v, triangle)
         options = self._options(counting=counters)
-        with self._crew(count) as crew:
-            for at, traced in self._stream(rays, dropped, options, crew, packets=packets):
-                if counters:
-                    counted[at] = traced[2]
-                check_ended(traced[1])
-                self._weigh(rays, at, traced, found, crew)
+
+        def take(at: np.ndarray, traced: tuple[np.ndarray, ...]) -> None:
+            check_ended(traced[1])
+            if counters:
+                visits[at] = traced[2]
+            self._weigh(rays, at, traced, found)
+
+        self._trace(rays, dropped, options, take, packets=packets)
         if counters:
-            counted[dropped == 1] = self._layout.missed if not self._empty else 0
-        counted = counters_of(counted) if counters else None
+            visits[dropped == 1] = self._layout.missed if not self._empty else 0
+        counted = counters_of(visits) if counters else None
         told = (t, face, u, v, triangle) if weights else (t, face, None, None, triangle)
         return Hits(*told, counted, *_instances_of(self._numbers, face, triangle))
 
-    def _crew(self, count: int) -> Crew:
-        """Who makes so many rays ready, and weighs hits: a thread a device, beside a GPU one a core."""
-        return Crew(self._hands if count >= MANY else 1)
-
-    def _weigh(
-        self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found, crew: Crew
-    ) -> None:
-        """Fill in what was found of the rays `at`."""
+    def _weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
+        """Fill in what was found of the rays `at`; beside a GPU all cores are free for it."""
 
         def weigh(part: tuple[int, int]) -> None:
             mine = slice(*part)
             mine_traced = tuple(a[mine] if len(a) == len(at) else a for a in traced)
             self._weighed(rays, at[mine], mine_traced, found)
 
-        in_chunks(weigh, len(at), crew)
+        in_chunks(weigh, len(at), self._weighers)
 
     def _weighed(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`, weights by the precision of the test."""
@@ -334,31 +328,32 @@ class Tracer:
         elif len(u) > 0 and self._test == "fast":
             weights_inside(at, found)
 
-    def _stream(
+    def _trace(
         self,
         rays: Rays,
         dropped: np.ndarray,
         options: WalkOptions | None,
-        crew: Crew,
+        take: Take,
         *,
         packets: bool = False,
-    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
-        """Trace rays; yield which ones are done, int32, and their results."""
+    ) -> None:
+        """Trace rays, and have what is found taken."""
         if options is None:
             return
         layout = self._layout
-        if isinstance(layout, InstancedLayout):
-            for part, traced in layout.stream(self._scene, rays, self._mesh, options):
-                yield np.arange(part.start, part.stop, dtype=np.int32), traced
-            return
-        if not options.batch:
-            given = (self._scene, self._layout, rays, dropped, self._mesh, options)
+        if not options.batch and not isinstance(layout, InstancedLayout):
             plain = not options.counting and options.test == "watertight"
-            in_packets = packets and plain and self._layout.seen_by_packets is not None
-            yield from stream_ready(*given, in_packets, crew)
+            in_packets = packets and plain and layout.seen_by_packets is not None
+            trace_ready(self._stations, layout, rays, dropped, options, in_packets, take)
             return
-        for part, traced in stream(self._scene, rays, self._mesh, options):
-            yield np.arange(part.start, part.stop, dtype=np.int32), traced
+        streamed = layout.stream if isinstance(layout, InstancedLayout) else stream
+        for part, traced in streamed(self._scene, rays, self._mesh, options):
+            take(np.arange(part.start, part.stop, dtype=np.int32), traced)
+
+    @cached_property
+    def _stations(self) -> list[Station]:
+        """Each CPU device on its own."""
+        return stations_of(self._scene, self._mesh)
 
     def any_hit(
         self,
@@ -372,10 +367,12 @@ class Tracer:
         rays = checked_rays(origins, directions, t_max)
         hit = np.zeros(len(rays[0]), np.bool_)
         dropped = np.zeros(len(rays[0]), np.uint8)
-        with self._crew(len(hit)) as crew:
-            for at, traced in self._stream(rays, dropped, self._options(any_hit=True), crew, packets=packets):
-                check_ended(traced[1])
-                mark_hits(at, traced[1], hit)
+
+        def take(at: np.ndarray, traced: tuple[np.ndarray, ...]) -> None:
+            check_ended(traced[1])
+            mark_hits(at, traced[1], hit)
+
+        self._trace(rays, dropped, self._options(any_hit=True), take, packets=packets)
         return hit
 
     def all_hits(
@@ -519,12 +516,9 @@ class Tracer:
         assert self._rebuild is not None
         return self._rebuild()
 
-    def _gather(
-        self, rays: Rays, kind: GatherKind, most: int
-    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+    def _gather(self, rays: Rays, kind: GatherKind, most: int, take: Take) -> None:
         dropped = np.zeros(len(rays[0]), np.uint8)
-        with self._crew(len(dropped)) as crew:
-            yield from self._stream(rays, dropped, self._options(gather=kind, most=most), crew)
+        self._trace(rays, dropped, self._options(gather=kind, most=most), take)
 
     def _options(
         self,
