@@ -1,4 +1,4 @@
-"""Threads over nogil kernels: equal chunks, parts by hash, jobs that give rise to more, a crew that stays.
+"""Threads over nogil kernels: equal chunks, parts by hash, jobs that give rise to more, or all at once.
 
 None decides anything: the caller's kernels write to disjoint places or return what is joined in order, so
 that results do not depend on the number of threads.
@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
+from threading import Event
 from typing import TypeVar
 
 SMALLEST_CHUNK = 1 << 14
@@ -17,7 +18,6 @@ CHUNKS_A_THREAD = 4
 """So that a thread that is held up does not hold up the others for long."""
 
 Result = TypeVar("Result")
-Thing = TypeVar("Thing")
 
 
 def every_core() -> int:
@@ -26,24 +26,18 @@ def every_core() -> int:
 
 
 def in_chunks(
-    work: Callable[[tuple[int, int]], Result],
-    count: int,
-    threads: "int | Crew",
-    smallest: int = SMALLEST_CHUNK,
+    work: Callable[[tuple[int, int]], Result], count: int, threads: int, smallest: int = SMALLEST_CHUNK
 ) -> list[Result]:
     """Do `work((begin, end))` for chunks that cover `0 .. count`, and give the results in order.
 
     With one thread, or fewer than twice `smallest` rows, it is one chunk in the thread of the caller.
     """
-    size = threads.size if isinstance(threads, Crew) else threads
-    chunks = min(size * CHUNKS_A_THREAD, count // smallest) if size > 1 else 1
+    chunks = min(threads * CHUNKS_A_THREAD, count // smallest) if threads > 1 else 1
     if chunks <= 1:
         return [work((0, count))]
-    bounds = pairwise([count * k // chunks for k in range(chunks + 1)])
-    if isinstance(threads, Crew):
-        return threads.each(work, bounds)
+    bounds = [count * k // chunks for k in range(chunks + 1)]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, bounds))
+        return list(pool.map(work, pairwise(bounds)))
 
 
 def in_parts(work: Callable[[int, int], Result], count: int, threads: int) -> list[Result]:
@@ -72,32 +66,29 @@ def run_jobs(work: Callable[..., Iterable[Iterable[int]]], first: tuple[int, ...
             pending |= {pool.submit(work, *job) for future in done for job in future.result()}
 
 
-class Crew:
-    """Threads that do the same to several things at once; leaving ends them.
+def at_once(work: Callable[[int, Event], None], count: int) -> None:
+    """Do `work(k, stopped)` for each k below `count`, each in a thread of its own; one alone in the caller's.
 
-    Args:
-        size: How many; with one the caller does it all.
+    `stopped` is set once one has failed or the caller is interrupted: then the others are to end soon. What
+    was raised is raised here once all have ended: of several exceptions that of the least k.
     """
+    stopped = Event()
 
-    def __init__(self, size: int) -> None:
-        self.size = size
-        self._pool = ThreadPoolExecutor(size) if size > 1 else None
+    def stopping(k: int) -> None:
+        try:
+            work(k, stopped)
+        except BaseException:
+            stopped.set()
+            raise
 
-    def __enter__(self) -> "Crew":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def each(self, work: Callable[[Thing], Result], things: Iterable[Thing]) -> list[Result]:
-        """Do `work(thing)` for each and give the results in order, once all are done.
-
-        An exception of one is raised once all are done: of several that of the first thing.
-        """
-        things = list(things)
-        if self._pool is None or len(things) < 2:
-            return [work(thing) for thing in things]
-        begun = [self._pool.submit(work, thing) for thing in things]
-        wait(begun)
-        return [future.result() for future in begun]
+    if count == 1:
+        work(0, stopped)
+        return
+    with ThreadPoolExecutor(max(1, count)) as pool:
+        begun = [pool.submit(stopping, k) for k in range(count)]
+        try:
+            wait(begun)
+        finally:
+            stopped.set()
+        for future in begun:
+            future.result()

@@ -225,8 +225,7 @@ def test_hits_are_weighed_by_many_threads_alike(monkeypatch):
     origins, directions = rays_at(scene, 1000, 3)
     tracer = Tracer(scene, device="cpu", threads=1)
     wanted = tracer.closest_hit(origins, directions)
-    tracer._hands = 3
-    monkeypatch.setattr("striptools.trace.tracer.MANY", 1)
+    tracer._weighers = 3
     monkeypatch.setattr("striptools.trace.tracer.in_chunks", partial(in_chunks, smallest=10))
     found = tracer.closest_hit(origins, directions)
     for name in ("t", "face", "u", "v", "triangle"):

@@ -1,6 +1,6 @@
-"""Rays dealt out to devices, made ready by a crew, and streamed in tiles: each once, whatever the devices."""
+"""Rays dealt out to devices, a thread each, and streamed in tiles: each once, whatever the devices."""
 
-from functools import partial
+import threading
 
 import numpy as np
 import pytest
@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from scenes import scene_of
 from strategies import sphere
 
-from striptools.kernels.packets import PACKET
+from striptools.errors import StriptoolsError
 from striptools.kernels.ray_order import deal
 from striptools.mesh.mesh import Mesh
-from striptools.threads import Crew
-from striptools.trace import Tracer, streams, tracer
+from striptools.trace import Tracer, streams
 from striptools.trace.rays import Camera, camera_rays
-from striptools.trace.streams import EVERY_RAY, kept, moved_together
+from striptools.trace.streams import EVERY_RAY
 
 
 @given(st.integers(0, 500), st.integers(1, 5), st.sampled_from([1, 4, 32]), st.booleans())
@@ -28,32 +27,6 @@ def test_rays_are_dealt_like_cards(every, hands, block, chosen):
     assert [deal(which, every, hand, hands, block).tolist() for hand in range(hands)] == expected
 
 
-@given(st.integers(0, 2**18), st.integers(1, 9))
-def test_hands_are_even_and_of_whole_packets(count, devices):
-    with Crew(1) as crew:
-        hands = streams._dealt(EVERY_RAY, count, devices, crew)
-    counts = [hand.count for hand in hands]
-    assert sum(counts) == count
-    assert max(counts) - min(counts) <= max(PACKET, count // (devices * streams.TURNS))
-    if devices > 1 and count:
-        dealt = np.concatenate([hand.which for hand in hands])
-        assert np.array_equal(np.sort(dealt), np.arange(count))
-        starts = hands[0].which[: counts[0] // PACKET * PACKET : PACKET]
-        assert (starts % PACKET == 0).all()
-
-
-@given(st.lists(st.integers(0, 6), min_size=1, max_size=5), st.integers(0, 3))
-def test_rows_are_moved_together_and_kept(live, spare):
-    room, places = 6, max(1, *live) if len(live) > 1 else max(1, live[0])
-    places = min(room, places + spare)
-    rows = np.arange(room * len(live) * 2, dtype=np.float32).reshape(-1, 2)
-    expected = np.concatenate([rows[k * room : k * room + some] for k, some in enumerate(live)])
-    moved = moved_together(rows.copy(), live, room, places)
-    assert moved.shape == (places * len(live), 2)
-    np.testing.assert_array_equal(kept(moved, live, places), expected)
-    assert kept(np.zeros(0), live, places).shape == (0,)
-
-
 def all_found(of, rays):
     """What a tracer finds, as bytes."""
     hits, packed = of.closest_hit(*rays, packets=False, counters=True), of.closest_hit(*rays)
@@ -64,19 +37,36 @@ def all_found(of, rays):
     return [np.asarray(a).tobytes() for a in arrays]
 
 
-@pytest.mark.parametrize("resident", ["expanded", "compressed"])
-def test_any_number_of_devices_and_any_tiles_find_the_same(monkeypatch, resident):
+@pytest.fixture(scope="module")
+def crowd():
+    """A scene, and rays of a picture of it and about it."""
     scene = scene_of(Mesh(*sphere(3)))
     seen = camera_rays(Camera.framing(scene.positions, width=96, height=50))
     random = np.random.default_rng(3)
     about = (random.uniform(-2, 2, (901, 3)), random.normal(size=(901, 3)))
-    rays = tuple(np.concatenate(pair).astype(np.float32) for pair in zip(seen, about, strict=True))
+    return scene, tuple(np.concatenate(pair).astype(np.float32) for pair in zip(seen, about, strict=True))
+
+
+@pytest.mark.parametrize("resident", ["expanded", "compressed"])
+def test_any_number_of_devices_and_any_tiles_find_the_same(crowd, monkeypatch, resident):
+    scene, rays = crowd
     one, two = (Tracer(scene, device="cpu", threads=k, resident=resident) for k in (1, 2))
-    assert len(two.devices) == 2, "two devices are asked for by the tests"
     expected = all_found(one, rays)
-    monkeypatch.setattr(tracer, "MANY", 1)
-    monkeypatch.setattr(tracer, "in_chunks", partial(tracer.in_chunks, smallest=100))
+    hands = []
+    honest = streams.deal
+
+    def noting(*given):
+        hands.append((threading.get_ident(), given[2]))
+        return honest(*given)
+
+    monkeypatch.setattr(streams, "deal", noting)
     assert all_found(two, rays) == expected
+    assert hands == [], "so few rays go through one device"
+    monkeypatch.setattr(streams, "MANY", 100)
+    monkeypatch.setattr(streams, "BLOCK", 64)
+    assert all_found(two, rays) == expected
+    assert {hand for _, hand in hands} == set(range(len(two.devices)))
+    assert len({thread for thread, _ in hands}) > 1
     # Tiles that are full many times over, and last ones that are nearly empty.
     monkeypatch.setattr(streams, "TILES", (2**6, 2**8))
     monkeypatch.setattr(streams, "PACKET_TILES", (2**3, 2**4))
@@ -85,8 +75,50 @@ def test_any_number_of_devices_and_any_tiles_find_the_same(monkeypatch, resident
 
 
 @pytest.mark.parametrize("count", [0, 1, 31, 33, 65])
-def test_few_rays_over_two_devices(count):
-    scene = scene_of(Mesh(*sphere(2)))
-    rays = np.zeros((count, 3), np.float32), np.ones((count, 3), np.float32)
+def test_few_rays(crowd, monkeypatch, count):
+    scene, rays = crowd
+    few = tuple(a[:count] for a in rays)
     one, two = (Tracer(scene, device="cpu", threads=k) for k in (1, 2))
-    assert all_found(one, rays) == all_found(two, rays)
+    expected = all_found(one, few)
+    monkeypatch.setattr(streams, "MANY", 1)
+    monkeypatch.setattr(streams, "BLOCK", 32)
+    assert all_found(two, few) == expected
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_where_one_device_fails_the_others_stop_and_it_is_told(crowd, monkeypatch, failing):
+    scene, (origins, directions) = crowd
+    tracer = Tracer(scene, device="cpu", threads=2)
+    monkeypatch.setattr(streams, "MANY", 100)
+    monkeypatch.setattr(streams, "BLOCK", 32)
+    monkeypatch.setattr(streams, "TILES", (2**6,))
+    dealt, taken = threading.local(), []
+    honest, weigh = streams.deal, tracer._weigh
+    failed = threading.Event()
+
+    def noting(*given):
+        dealt.hand = given[2]
+        return honest(*given)
+
+    def weighing(*given):
+        if dealt.hand == failing:
+            failed.set()
+            raise StriptoolsError("a device fails")
+        assert failed.wait(60)
+        taken.append(len(given[1]))
+        return weigh(*given)
+
+    monkeypatch.setattr(streams, "deal", noting)
+    monkeypatch.setattr(tracer, "_weigh", weighing)
+    with pytest.raises(StriptoolsError, match="a device fails"):
+        tracer.closest_hit(origins, directions, packets=False)
+    assert len(taken) <= 2, "the other device went on"
+
+
+def test_each_device_has_the_scene_where_it_lies(crowd):
+    tracer = Tracer(crowd[0], device="cpu", threads=2)
+    stations = tracer._stations
+    assert [station.mesh.devices.tolist() for station in stations] == [[each] for each in tracer.devices]
+    for station, device in zip(stations, tracer.devices, strict=True):
+        assert station.scene.nodes.devices() == {device}
+        assert station.scene.nodes.unsafe_buffer_pointer() == tracer._layout.arrays.nodes.ctypes.data

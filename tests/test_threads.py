@@ -1,48 +1,62 @@
-"""A crew: results in order, all done before any is told, exceptions raised."""
+"""Threads that do the same at once: each in one of its own, stopped by each other's exceptions."""
 
 import threading
-import time
 
 import pytest
 
-from striptools.threads import Crew, in_chunks
+from striptools.threads import at_once
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
-def test_each_thing_is_done_once_and_told_in_order(size):
-    threads = set()
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_each_is_done_once_in_a_thread_of_its_own(count):
+    done, together = {}, threading.Barrier(max(1, count))
 
-    def square(number):
-        time.sleep(0.001 * (3 - number % 4))
-        threads.add(threading.get_ident())
-        return number * number
+    def work(k, stopped):
+        together.wait(60)
+        assert not stopped.is_set()
+        done[k] = threading.get_ident()
 
-    with Crew(size) as crew:
-        for count in (0, 1, 2, 20):
-            assert crew.each(square, range(count)) == [number * number for number in range(count)]
-        assert crew.each(square, iter([3])) == [9]
-    mine = threading.get_ident()
-    assert threads == {mine} if size == 1 else len(threads - {mine}) == size
+    at_once(work, count)
+    assert sorted(done) == list(range(count))
+    assert len(set(done.values())) == count
+    assert (threading.get_ident() in done.values()) == (count == 1)
 
 
-@pytest.mark.parametrize("size", [1, 3])
-def test_an_exception_is_raised_once_all_are_done(size):
-    done = []
+@pytest.mark.parametrize("failing", [{0}, {2}, {1, 2}])
+def test_what_was_raised_is_raised_once_all_have_stopped(failing):
+    ended, together = [], threading.Barrier(3)
 
-    def work(number):
-        if number in (1, 2):
-            raise ValueError(f"number {number}")
-        time.sleep(0.01)
-        done.append(number)
+    def work(k, stopped):
+        together.wait(60)
+        if k in failing:
+            raise ValueError(f"number {k}")
+        assert stopped.wait(60)
+        ended.append(k)
 
-    with Crew(size) as crew:
-        with pytest.raises(ValueError, match="number 1"):
-            crew.each(work, [0, 1, 2, 3])
-        assert sorted(done) == ([0] if size == 1 else [0, 3])
-        assert crew.each(abs, [-1, -2]) == [1, 2]
+    with pytest.raises(ValueError, match=f"number {min(failing)}"):
+        at_once(work, 3)
+    assert sorted(ended) == sorted({0, 1, 2} - failing)
 
 
-@pytest.mark.parametrize("count", [0, 9, 10, 100, 101])
-def test_chunks_are_the_same_by_a_crew(count):
-    with Crew(3) as crew:
-        assert in_chunks(list, count, crew, 5) == in_chunks(list, count, 3, 5)
+def test_one_alone_raises_too():
+    def work(k, stopped):
+        raise KeyError(k)
+
+    with pytest.raises(KeyError):
+        at_once(work, 1)
+
+
+def test_an_interrupt_of_the_caller_stops_all(monkeypatch):
+    ended = []
+
+    def work(k, stopped):
+        assert stopped.wait(60)
+        ended.append(k)
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("striptools.threads.wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        at_once(work, 3)
+    assert sorted(ended) == [0, 1, 2]

@@ -20,7 +20,7 @@ from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.pictures import row_width, tile_order
 from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
 from striptools.kernels.rays import ROW, ready_rays
-from striptools.threads import Crew
+from striptools.threads import at_once
 from striptools.trace.device import quiet_jax
 from striptools.trace.launch import RAYS, TILES, device_mesh, program
 from striptools.trace.layout import Layout, Rays
@@ -96,26 +96,17 @@ def trace_ready(
     width = row_width(*rays[:2]) if packets else 0
     order = tile_order(count, width) if width else EVERY_RAY
     hands = stations[: max(1, min(len(stations), count // MANY))]
-    stopped = Event()
 
-    def trace(hand: int) -> None:
+    def trace(hand: int, stopped: Event) -> None:
         which = deal(order, count, hand, len(hands), BLOCK) if len(hands) > 1 else order
         course = _Course(hands[hand], layout, rays, which, dropped, options)
-        try:
-            for found in course.packets() if packets else course.singles():
-                if stopped.is_set():
-                    return
-                take(*found)
-        except BaseException:
-            stopped.set()
-            raise
+        for found in course.packets() if packets else course.singles():
+            if stopped.is_set():
+                return
+            take(*found)
 
-    with quiet_jax(), Crew(len(hands)) as crew:
-        try:
-            crew.each(trace, range(len(hands)))
-        finally:
-            # Where this thread is interrupted, the others end with the tiles that they are at.
-            stopped.set()
+    with quiet_jax():
+        at_once(trace, len(hands))
 
 
 Found = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
