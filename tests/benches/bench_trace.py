@@ -3,12 +3,13 @@
     python tests/benches/bench_trace.py MODEL [MODEL ...] [--repeats 15] [--hierarchy both] [--record]
         [--beside] [--note TEXT]
 
-MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed. Ambient
-occlusion: one cosine-distributed ray from each point that the camera sees, asked for its closest hit and for
-any hit. Random rays: 2**18 from anywhere in the model's bounds in any direction. Through the stored hierarchy
-of the scene, a rebuilt one, or both. The tracers take turns; a ratio is the median of the ratios of runs next
-to each other in time. The process stays on one core, or what the tracer does beside its walk would have
-another for nothing; `--beside` leaves it that. Linux only.
+MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed.
+Ambient occlusion: one cosine-distributed ray from each point that the camera sees. Both are asked for
+closest hits with and without weights (u and v, which peers work out but do not hand over), occlusion for
+any hit too. Random rays: 2**18 from anywhere in the model's bounds in any direction. Through the stored
+hierarchy of the scene, a rebuilt one, or both. The tracers take turns; a ratio is the median of the ratios
+of runs next to each other in time. The process stays on one core, or what the tracer does beside its walk
+would have another for nothing; `--beside` leaves it that. Linux only.
 """
 
 import os
@@ -156,13 +157,21 @@ def measure(
         for metric, rays, call, other in (
             ("camera rays, closest hit", camera, "closest", peer.closest),
             ("AO rays, closest hit", occlusion, "closest", peer.closest),
+            ("camera rays, closest hit without weights", camera, "faces", peer.closest),
+            ("AO rays, closest hit without weights", occlusion, "faces", peer.closest),
             ("AO rays, any hit", occlusion, "any", peer.any),
             ("random rays, closest hit", (anywhere.origins, anywhere.directions), "closest", peer.closest),
         ):
-            ours = tracer.any_hit if call == "any" else lambda *r: tracer.closest_hit(*r).triangle
-            found = _compare(name, count, metric, rays, ours, other, repeats, note)
+            found = _compare(name, count, metric, rays, asked(tracer, call), other, repeats, note)
             rows.append(replace(found, peer=peer_name))
     return rows
+
+
+def asked(tracer: Tracer, call: str) -> Callable:
+    """What peers tell: a face, or whether there is one; ours tells t too, and weights if they are asked."""
+    if call == "any":
+        return tracer.any_hit
+    return lambda *rays: tracer.closest_hit(*rays, weights=call == "closest").triangle
 
 
 def _compare(
