@@ -1,6 +1,5 @@
 """The walks of a GPU, on a CPU: the plain-JAX twin of the kernel, and the kernel by Pallas' interpreter."""
 
-from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import Any
 
@@ -10,7 +9,9 @@ import numpy as np
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.launch import stream_through
+from striptools.trace.layout import Rays
 from striptools.trace.pallas import walk as kernel
+from striptools.trace.streams import Take
 from striptools.trace.tracer import ResidentKind
 from striptools.trace.walk import Traced, WalkOptions, WalkScene, prepared_rays, walk_rays
 
@@ -36,13 +37,19 @@ class GpuWalk(Tracer):
         super().__init__(scene, device="cpu", threads=1, resident=resident)
         self._by_kernel = by_kernel
 
-    def _stream(
-        self, rays: tuple[np.ndarray, ...], dropped: np.ndarray, options: WalkOptions | None, **_: bool
-    ) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]:
+    def _trace(
+        self,
+        rays: Rays,
+        dropped: np.ndarray,
+        options: WalkOptions | None,
+        take: Take,
+        *,
+        packets: bool = False,
+    ) -> None:
         assert options is not None
         walk = _program(self._by_kernel, options._replace(interleave=1, batch=True))
         for part, traced in stream_through(walk, self._scene, rays, self._mesh, RAYS_AT_ONCE):
-            yield np.arange(part.start, part.stop, dtype=np.int32), traced
+            take(np.arange(part.start, part.stop, dtype=np.int32), traced)
 
 
 @lru_cache(maxsize=16)
