@@ -1,7 +1,10 @@
 """Settings and fixtures that all tests share."""
 
+import ctypes
+import gc
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,6 +13,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parent.parent
+MOST_MEMORY = 2 << 30
+"""Bytes of a process beyond which compiled programs are let go."""
+
 SLOW_ON_PURPOSE = (HealthCheck.too_slow, HealthCheck.data_too_large)
 
 # Kernels compile inside the first example, so no example has a deadline.
@@ -39,6 +45,19 @@ def real_mesh() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture(autouse=True, scope="module")
+def programs_let_go() -> Iterator[None]:
+    """Forget compiled programs after a file of tests where they take much memory: there are thousands."""
+    yield
+    held = Path("/proc/self/statm")
+    pages = int(held.read_text().split()[1]) if held.exists() else 0
+    if "jax" in sys.modules and pages * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
+        # What is free goes back to the system, where the C library can be told.
+        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
 
 
 @pytest.fixture
