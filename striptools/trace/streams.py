@@ -40,8 +40,8 @@ BLOCK = 2**10
 IN_FLIGHT = 2
 """Tiles that a device works on or waits for: more only push each other's rays out of the cache."""
 
-LEAST_SORTED = 2**24
-"""Bytes of a scene for which rays are sorted: one in a core's own caches is read as fast in any order."""
+LEAST_SORTED = 2**25
+"""Bytes of a scene for which rays are sorted: one in the caches is read as fast in any order."""
 
 SORTED = 2**19
 """Rays that are sorted together."""
@@ -290,12 +290,13 @@ class _Pipe:
 # On one core rays made ready 64 at a time gave 1.15 (occlusion rays), packets over whole registers 1.1, hits
 # weighed with leaves touched beforehand 1.05, fetched while others are weighed 1.03 more (a camera's 1.05).
 #
-# Rays sorted, one core, rates of closest / any hits. Shuffled occlusion rays: terrain of 276,000 triangles
-# 1.3 / 1.3, dragon 1.3 / 1.3, 3.5 M triangles 1.6 / 1.7. Random rays: 1.02 / 1.14, 1.05 / 1.0, 1.1 / 1.1; a
-# power plant 1.3 / 1.1. Bunny (5 MB) 0.7 / 0.75, since rays taken here and there cost 20 to 40 ns. Runs of
-# 2**18 gain less, 2**20 no more. Occlusion rays as a camera's tiles give them walk 1.05 / 1.03 times as fast,
-# and lose that beside the walk. Cells alone, in place of cells and octants: as good; octants first 1.0;
-# octants and dominant axes no better.
+# Rays sorted, one core, rates of closest / any hits (`bench_order`; machines differ, by 0.2 on another
+# hour). Shuffled occlusion rays: dragon 1.2 / 1.2, 3.5 M triangles 1.4 / 1.3, power plant 1.1 / 1.1. Random
+# rays: 0.97 / 0.99, 1.03 / 1.01, 1.3 / 1.1. A terrain of 276,000 triangles, 20 MB: shuffled 1.2, random
+# 0.95; the bunny, 5 MB: 0.98, 0.85, since rays taken here and there cost 20 to 40 ns. Runs of 2**18 gain
+# less, 2**20 no more. Occlusion rays as a camera's tiles give them walk 1.05 / 1.03 times as fast, and lose
+# that beside the walk. Cells alone, in place of cells and octants: as good; octants first 1.0; octants and
+# dominant axes no better.
 #
 # Tried for packets and lost: tiles of 2**9 to 2**13 of them 0.99 to 1.0. A program in which the rays of a
 # packet start at one point, read once: 1.01 to 1.02, not worth a program more.
