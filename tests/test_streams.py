@@ -12,7 +12,7 @@ from strategies import sphere
 from striptools.errors import StriptoolsError
 from striptools.kernels.ray_order import deal
 from striptools.mesh.mesh import Mesh
-from striptools.trace import Tracer, streams
+from striptools.trace import Tracer, launch, streams
 from striptools.trace.rays import Camera, camera_rays
 from striptools.trace.streams import EVERY_RAY
 
@@ -113,6 +113,21 @@ def test_where_one_device_fails_the_others_stop_and_it_is_told(crowd, monkeypatc
     with pytest.raises(StriptoolsError, match="a device fails"):
         tracer.closest_hit(origins, directions, packets=False)
     assert len(taken) <= 2, "the other device went on"
+
+
+def test_devices_that_make_rays_ready_share_one_sharded_program(crowd, monkeypatch):
+    """As several GPUs do."""
+    scene, (origins, directions) = crowd
+    few = origins[:700], directions[:700], np.full(700, np.inf, np.float32)
+    tracer = Tracer(scene, device="cpu", threads=2)
+    monkeypatch.setattr(launch, "GPU_TILES", (2**5, 2**7))
+    options = tracer._options()
+    assert options is not None
+    options = options._replace(batch=True, interleave=1)
+    found = list(launch.stream(tracer._scene, few, tracer._mesh, options))
+    assert [part.stop for part, _ in found] == [256, 512, 700]
+    names = np.concatenate([traced[1] for _, traced in found])
+    np.testing.assert_array_equal(names, tracer.closest_hit(*few[:2], packets=False).face)
 
 
 def test_each_device_has_the_scene_where_it_lies(crowd):
