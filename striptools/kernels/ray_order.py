@@ -10,6 +10,7 @@ Cost: linear; two passes of a radix sort, 12 bytes a ray while it runs.
 import numpy as np
 
 from striptools.kernels.compiled import helper, inlined, kernel
+from striptools.kernels.morton import spread_bits
 from striptools.kernels.rays import ray_at
 
 BITS = 5
@@ -29,15 +30,12 @@ RAY = 32
 
 ZERO = np.float32(0)
 
-SPREAD = np.array([sum((k >> b & 1) << 3 * b for b in range(BITS)) for k in range(2**BITS)], np.int32)
-"""The bits of a number, each three places apart."""
-
 
 @inlined
 def cell_at(place, low, finer):
     """The number of a cell along an axis, the nearest to a place outside; 0 for what is not a number."""
     cell = (place - low) * finer
-    return np.int64(min(cell, CELLS - np.float32(1)) if cell > ZERO else ZERO)
+    return np.uint64(min(cell, CELLS - np.float32(1)) if cell > ZERO else ZERO)
 
 
 @kernel
@@ -67,13 +65,13 @@ def count_keys(origins, directions, which, begin, low, finer, keys, ends):
     """Write keys and numbers of rays, and count how often each half of a key has each value."""
     for k in range(len(keys)):
         r = ray_at(which, begin + k)
-        x = SPREAD[cell_at(origins[r, 0], low[0], finer)]
-        y = SPREAD[cell_at(origins[r, 1], low[1], finer)]
-        z = SPREAD[cell_at(origins[r, 2], low[2], finer)]
+        cell = np.uint64(0)
+        for axis in range(3):
+            cell |= spread_bits(cell_at(origins[r, axis], low[axis], finer)) << np.uint64(axis)
         octant = np.int32(directions[r, 0] < ZERO)
         octant |= np.int32(directions[r, 1] < ZERO) << 1 | np.int32(directions[r, 2] < ZERO) << 2
-        key = (x | y << 1 | z << 2) << 3 | octant
-        keys[k] = np.int64(key) << RAY | r
+        key = np.int64(cell) << 3 | octant
+        keys[k] = key << RAY | r
         ends[0, key & (DIGITS - 1)] += 1
         ends[1, key >> DIGIT] += 1
 

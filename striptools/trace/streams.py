@@ -109,7 +109,7 @@ def trace_ready(
         at_once(trace, len(hands))
 
 
-Found = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
+Parts = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
 """What a `Take` takes."""
 
 
@@ -137,13 +137,13 @@ class _Course(NamedTuple):
         """How many rays go this way."""
         return len(self.which) or len(self.rays[0])
 
-    def singles(self) -> Found:
+    def singles(self) -> Parts:
         """Trace each ray on its own."""
         pipe = self._single_pipe()
         yield from self._send_each(pipe, self.which)
         yield from pipe.drain()
 
-    def packets(self) -> Found:
+    def packets(self) -> Parts:
         """Trace rays in packets, those that go the same way."""
         single = self._single_pipe()
         shape = (-(-self.total // PACKET), PACKET_ROW)
@@ -166,7 +166,7 @@ class _Course(NamedTuple):
         words = ROW + 3 * wants_way(self.options.test)
         return _Pipe(self.station, self.options, TILES, (self.total, words), ())
 
-    def _send_each(self, pipe: "_Pipe", which: np.ndarray) -> Found:
+    def _send_each(self, pipe: "_Pipe", which: np.ndarray) -> Parts:
         """Send rays, each on its own."""
         seen = (tuple(self.layout.arrays.frame), *self.layout.root)
         for part in self._in_order(which):
@@ -179,8 +179,11 @@ class _Course(NamedTuple):
 
     def _in_order(self, which: np.ndarray) -> Iterator[np.ndarray]:
         """Rays as they come; where most jump about in a large scene, sorted, so that neighbours go alike."""
-        low, finer = cells_of(self.layout)
-        if self.layout.nbytes < LEAST_SORTED or not start_apart(self.rays[0], which, finer):
+        if self.layout.nbytes < LEAST_SORTED:
+            yield which
+            return
+        low, finer = _cells_of(self.layout)
+        if not start_apart(self.rays[0], which, finer):
             yield which
             return
         count = len(which) or len(self.rays[0])
@@ -188,7 +191,7 @@ class _Course(NamedTuple):
             yield sort_rays(*self.rays[:2], which, first, min(first + SORTED, count), low, finer)
 
 
-def cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
+def _cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
     """Where the cells begin that rays are sorted by, and how many there are in a unit of length."""
     frame, box = layout.arrays.frame, layout.root[0]
     corners = np.stack([np.nanmin(box[:3], axis=1), np.nanmax(box[3:6], axis=1)]).astype(np.float64)
@@ -238,13 +241,13 @@ class _Pipe:
             self._filling = self._spare.pop() if self._spare else self._new()
         return _Buffers(self._filling.rows[self._filled :], self._filling.at[self._filled :])
 
-    def fill(self, live: int) -> Found:
+    def fill(self, live: int) -> Parts:
         """Take the first `live` of them as filled; send all once they are, and yield what is done."""
         self._filled += live
         if self._filling is not None and self._filled == len(self._filling.rows):
             yield from self._send()
 
-    def drain(self) -> Found:
+    def drain(self) -> Parts:
         """Send what is left, and yield all that is on its way."""
         if self._filled:
             yield from self._send()
@@ -255,7 +258,7 @@ class _Pipe:
         rows = aligned_zeros(self._shape, np.float32)
         return _Buffers(rows, np.zeros((len(rows), *self._lanes), np.int32))
 
-    def _send(self) -> Found:
+    def _send(self) -> Parts:
         buffers, live = self._filling, self._filled
         assert buffers is not None
         self._filling, self._filled = None, 0

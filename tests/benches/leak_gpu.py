@@ -38,13 +38,7 @@ class GpuWalk(Tracer):
         self._by_kernel = by_kernel
 
     def _trace(
-        self,
-        rays: Rays,
-        dropped: np.ndarray,
-        options: WalkOptions | None,
-        take: Take,
-        *,
-        packets: bool = False,
+        self, rays: Rays, dropped: np.ndarray, options: WalkOptions | None, take: Take, **_: bool
     ) -> None:
         assert options is not None
         walk = _program(self._by_kernel, options._replace(interleave=1, batch=True))
