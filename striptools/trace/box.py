@@ -47,6 +47,9 @@ from jax import Array
 
 from striptools.trace.numerics import larger, smaller
 
+Coordinates = Array | tuple[Array, Array, Array]
+"""Of a point or direction along three axes."""
+
 FAR_FACTOR = np.float32(1 + 2**-21)
 """At least 1 + 2 gamma_3."""
 
@@ -68,28 +71,32 @@ TINY = np.float32(2**-60)
 class Slab(NamedTuple):
     """Origin times inverse direction, for low and for high sides, and the inverse direction.
 
-    (3,) each; counted from the frame's `low` and in its `unit`.
+    Three each; counted from the frame's `low` and in its `unit`.
     """
 
-    low: Array
-    high: Array
-    inverse: Array
+    low: Any
+    high: Any
+    inverse: Any
 
 
-def slab_of(origin: Array, direction: Array, frame: Any) -> Slab:
-    """Slab constants of a ray.
+def slab_of(origin: Coordinates, direction: Coordinates, frame: Any) -> Slab:
+    """Slab constants of a ray, or of many at once.
 
     Args:
-        origin: (3,) float32.
-        direction: (3,) float32, its largest component 1 to 2 in size.
+        origin: Three float32.
+        direction: Three float32, the largest 1 to 2 in size.
         frame: A `walk.Frame`.
     """
-    size = jnp.abs(origin)
-    margin = frame.margin * larger(larger(size[0], size[1]), larger(size[2], frame.reach))
-    tiny = jnp.where(direction < 0, -TINY, TINY)
-    inverse = 1 / jnp.where(jnp.abs(direction) < TINY, tiny, direction)
-    low, high = origin + margin - frame.low, origin - margin - frame.low
-    return Slab(low * inverse, high * inverse, inverse * frame.unit)
+    largest = larger(larger(abs(origin[0]), abs(origin[1])), larger(abs(origin[2]), frame.reach))
+    margin = frame.margin * largest
+    low, high, inverse = [], [], []
+    for at, way, start, unit in zip(origin, direction, frame.low, frame.unit, strict=True):
+        tiny = jnp.where(way < 0, -TINY, TINY)
+        turned = 1 / jnp.where(abs(way) < TINY, tiny, way)
+        low.append((at + margin - start) * turned)
+        high.append((at - margin - start) * turned)
+        inverse.append(turned * unit)
+    return Slab(low, high, inverse)
 
 
 def lanes_met(boxes: Array, slab: Slab, nearest: Array) -> Array:

@@ -25,12 +25,14 @@ Differences:
 Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from striptools.trace.box import Coordinates
 from striptools.trace.numerics import (
     BY_XLA,
     Arithmetic,
@@ -83,9 +85,11 @@ class Edges(NamedTuple):
     y: Corners
 
 
-def shear_of(origin: Array, direction: Array) -> Shear:
-    """Shear constants of a ray; `direction` must not be zero."""
-    size = jnp.abs(direction)
+def shear_of(
+    origin: Coordinates, direction: Coordinates, divided: Callable[[Array, Array], Array] = quotient
+) -> Shear:
+    """Shear constants of a ray, or of many at once; `direction` must not be zero."""
+    size = [abs(way) for way in direction]
     z = jnp.where((size[0] >= size[1]) & (size[0] >= size[2]), 0, jnp.where(size[1] >= size[2], 1, 2))
     x = jnp.where(z == 2, 0, z + 1)
     y = jnp.where(x == 2, 0, x + 1)
@@ -95,29 +99,33 @@ def shear_of(origin: Array, direction: Array) -> Shear:
     return Shear(
         axes,
         (pick(origin, x), pick(origin, y), pick(origin, z)),
-        quotient(pick(direction, x), depth),
-        quotient(pick(direction, y), depth),
-        quotient(jnp.ones_like(depth), depth),
+        divided(pick(direction, x), depth),
+        divided(pick(direction, y), depth),
+        divided(jnp.ones_like(depth), depth),
     )
 
 
-def pick(vector: Array | tuple[Array, Array, Array], axis: Array) -> Array:
+def pick(vector: Coordinates, axis: Array) -> Array:
     """The coordinate of a (3,) vector along an axis."""
     return jnp.where(axis == 0, vector[0], jnp.where(axis == 1, vector[1], vector[2]))
 
 
 def edges_of(x: Corners, y: Corners, z: Corners, shear: Shear, arithmetic: Arithmetic = BY_XLA) -> Edges:
     """Edge functions of one triangle or of a block of them, its coordinates along the axes of the shear."""
+    x, y, heights = sheared(x, y, z, shear, arithmetic)
+    a, b, c = (arithmetic.product(h, shear.z) for h in heights)
+    around = _straddle(*x, arithmetic) & _straddle(*y, arithmetic)
+    return Edges(*edge_functions(x, y, arithmetic), (a, b, c), around, y)
+
+
+def edge_functions(x: Corners, y: Corners, arithmetic: Arithmetic = BY_XLA) -> tuple[Array, Array, Array]:
+    """Of the edges across from corners a, b and c, of sheared corners."""
     product = arithmetic.product
-    (ax, bx, cx), (ay, by, cy), heights = sheared(x, y, z, shear, arithmetic)
-    a, b, c = (product(h, shear.z) for h in heights)
-    return Edges(
+    (ax, bx, cx), (ay, by, cy) = x, y
+    return (
         product(cx, by) - product(cy, bx),
         product(ax, cy) - product(ay, cx),
         product(bx, ay) - product(by, ax),
-        (a, b, c),
-        _straddle(ax, bx, cx, arithmetic) & _straddle(ay, by, cy, arithmetic),
-        (ay, by, cy),
     )
 
 

@@ -33,10 +33,11 @@ from jax import Array, lax
 from jaxtyping import Int32
 
 from striptools.kernels.wide import WIDTH
-from striptools.trace.box import Slab, slab_of
+from striptools.trace.box import Coordinates, Slab, slab_of
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import (
     BY_XLA,
+    HIGHEST,
     Arithmetic,
     any_lane,
     folded,
@@ -102,6 +103,9 @@ class Best(NamedTuple):
     nearest: Array
     name: Array
 
+
+Divided = Callable[[Array, Array], Array]
+"""A quotient of two."""
 
 Found = Best | Gathered
 """What a ray has found so far: both have a `nearest`, beyond which nothing matters."""
@@ -448,45 +452,58 @@ def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root
 
 
 def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) -> tuple[Array, Array]:
-    """Floats and ints of a `ReadyRay`.
+    """Floats and ints of a `ReadyRay`."""
+    floats, ints = ready_words(scene.frame, origin, direction, t_max)
+    zero = jnp.int32(0)
+    return jnp.stack(floats), jnp.stack([*ints, zero, zero])
+
+
+def ready_words(
+    frame: Frame, origin: Coordinates, direction: Coordinates, t_max: Array, divided: Divided = quotient
+) -> tuple[list[Array], list[Array]]:
+    """The 17 floats of a `ReadyRay`, or of many at once, and its first five integers.
 
     A ray is scaled by powers of two: neither the model's unit nor the direction's length matters after that.
+
+    Args:
+        frame: Of the scene.
+        origin: Three float32.
+        direction: Three float32.
+        t_max: Float32.
+        divided: A quotient, rounded correctly by the compiler at hand.
     """
-    frame = scene.frame
     longest = largest_of(direction)
     shorten, length = power_of_two_below(longest)
     origin, direction, finite = scaled_ray(frame, origin, direction)
     valid = finite & (longest >= np.finfo(np.float32).tiny) & (t_max > 0)
-    octant = 7 ^ jnp.where(direction < 0, jnp.array([1, 2, 4], jnp.int32), 0).sum()
+    octant = jnp.full_like(valid, 7, jnp.int32)
+    for bit, way in zip((1, 2, 4), direction, strict=True):
+        octant = octant ^ jnp.where(way < 0, jnp.int32(bit), jnp.int32(0))
     slab = slab_of(origin, direction, frame)
-    shear = shear_of(origin, direction)
-    rest = [
-        *shear.origin,
-        shear.x,
-        shear.y,
-        shear.z,
-        t_max * length * frame.scale,
-        quotient(shorten, frame.scale),
-    ]
-    floats = jnp.concatenate([slab.low, slab.high, slab.inverse, jnp.stack(rest)])
-    start = jnp.where(valid, DONE, 0)
-    zero = jnp.int32(0)
+    shear = shear_of(origin, direction, divided)
+    limit = t_max * length * frame.scale
+    unit = divided(shorten, jnp.broadcast_to(frame.scale, shorten.shape))
+    floats = [*slab.low, *slab.high, *slab.inverse, *shear.origin, shear.x, shear.y, shear.z, limit, unit]
     axes = (axis.astype(jnp.int32) for axis in shear.axes)
-    return floats, jnp.stack([*axes, octant, start, zero, zero])
+    return floats, [*axes, octant, jnp.where(valid, DONE, jnp.int32(0))]
 
 
-def largest_of(vector: Array) -> Array:
+def largest_of(vector: Coordinates) -> Array:
     """The largest of three coordinates, in size."""
-    size = jnp.abs(vector)
-    return larger(larger(size[0], size[1]), size[2])
+    return larger(larger(abs(vector[0]), abs(vector[1])), abs(vector[2]))
 
 
-def scaled_ray(frame: Frame, origin: Array, direction: Array) -> tuple[Array, Array, Array]:
+def scaled_ray(
+    frame: Frame, origin: Coordinates, direction: Coordinates
+) -> tuple[Coordinates, Coordinates, Array]:
     """A ray scaled by powers of two, the direction's largest component to 1 to 2; whether it is finite."""
     shorten = power_of_two_below(largest_of(direction))[0]
-    origin = origin * frame.scale
-    finite = jnp.isfinite(origin).all() & jnp.isfinite(direction).all()
-    return origin, direction * shorten, finite
+    ox, oy, oz = (at * frame.scale for at in origin)
+    finite = jnp.ones_like(shorten, bool)
+    for at in (ox, oy, oz, *direction):
+        finite = finite & (abs(at) <= HIGHEST)
+    x, y, z = (way * shorten for way in direction)
+    return (ox, oy, oz), (x, y, z), finite
 
 
 def next_child(

@@ -384,7 +384,7 @@ def _walk_ray(
     scene: InstancedScene, ray: tuple[Array, ...], options: WalkOptions, in_place: bool
 ) -> InstancesTraced:
     """Walk one ray over the instances."""
-    origin, direction, _ = scaled_ray(scene.frame, *ray[:2])
+    origin, direction = map(jnp.stack, scaled_ray(scene.frame, *ray[:2])[:2])
     # Of a `WalkScene` it has what the walk of one ray asks.
     seen: Any = _Seen(scene, origin, direction, larger(largest_of(origin), scene.frame.reach), in_place)
     row = prepared_rays(seen, ray[0][None], ray[1][None], ray[2][None], options.test)[0]
