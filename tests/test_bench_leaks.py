@@ -171,14 +171,14 @@ def test_a_fault_in_what_a_gpu_runs_is_seen(
     monkeypatch: pytest.MonkeyPatch,
     name: str,
 ) -> None:
-    def blind(walk):
+    def blind(trace):
         """The walk of nodes whose first child's box is none."""
-        return lambda scene, ready, options, **given: walk(
-            scene._replace(nodes=scene.nodes.at[:, 0, 0].set(np.nan)), ready, options, **given
+        return lambda scene, *given, **options: trace(
+            scene._replace(nodes=scene.nodes.at[:, :6, 0].set(np.nan)), *given, **options
         )
 
     for module in (kernel, leak_gpu):
-        monkeypatch.setattr(module, "walk_rays", blind(module.walk_rays))
+        monkeypatch.setattr(module, "trace_rays", blind(module.trace_rays))
     leak_gpu._program.cache_clear()
     table = bench.Table()
     bench.trace_all(table, Place(), scene, target, few, (leak_walks.MAIN[0], replace(aside(name), most=64)))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,10 +17,13 @@ from scenes import scene_of, small_scene
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.mesh.mesh import Mesh
 from striptools.threads import in_chunks
-from striptools.trace import SlowTracingWarning, Tracer, launch
+from striptools.trace import SlowTracingWarning, Tracer, functional, launch
 from striptools.trace.leaves import lay_out_rebuilt
+from striptools.trace.pallas import tiles
 from striptools.trace.pallas import walk as kernel
-from striptools.trace.walk import DONE, STUCK, WalkOptions, prepared_rays, walk_rays
+from striptools.trace.pallas.arithmetic import BY_INTERPRETER
+from striptools.trace.triangle import Edges, crossing_of, edge_functions
+from striptools.trace.walk import DONE, STUCK, WalkOptions, trace_rays
 
 COUNT = 64
 
@@ -35,11 +39,14 @@ def odd_rays(scene, count=COUNT, seed=1):
     return origins, directions, reach
 
 
-def walked(walk, tracer, ready, options):
+def walked(trace, tracer, rays, options):
     """Results of a walk, without the optimizations that make the kernel's program slow to compile."""
     quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    program = jax.jit(partial(walk, options=options)).lower(tracer._scene, ready)
-    return program.compile(compiler_options=quick)(tracer._scene, ready)
+    program = jax.jit(partial(trace, options=options)).lower(tracer._scene, *rays)
+    return program.compile(compiler_options=quick)(tracer._scene, *rays)
+
+
+interpreted = partial(kernel.trace_rays, interpret=True)
 
 
 def options_of(tracer, *, any_hit=False):
@@ -53,9 +60,7 @@ def differences(scene, resident, *, any_hit=False):
 
 
 def differences_of(tracer, rays, options):
-    ready = jax.jit(prepared_rays)(tracer._scene, *rays)
-    wanted = walked(walk_rays, tracer, ready, options)
-    found = walked(partial(kernel.walk_rays, interpret=True), tracer, ready, options)
+    wanted, found = (walked(trace, tracer, rays, options) for trace in (trace_rays, interpreted))
     pairs = [
         (np.asarray(a).view(np.int32), np.asarray(b).view(np.int32))
         for a, b in zip(wanted, found, strict=True)
@@ -120,25 +125,70 @@ def test_a_deep_stack_is_kept():
     rays = origins, directions, np.full(COUNT, np.inf, np.float32)
     options = options_of(tracer)
     assert differences_of(tracer, rays, options) == (0, COUNT)
-    # Entries beyond one tile's eight were in use.
-    ready = jax.jit(prepared_rays)(tracer._scene, *rays)
-    full, short = (
-        walked(partial(kernel.walk_rays, interpret=True), tracer, ready, options._replace(stack_size=size))
-        for size in (options.stack_size, 8)
-    )
+    # Entries beyond those in registers were in use: where there is room for one more, it serves all.
+    cut = options._replace(stack_size=kernel.SHORT + 1)
+    full, short = (walked(interpreted, tracer, rays, each) for each in (options, cut))
     assert (np.asarray(full.name) != np.asarray(short.name)).any()
+
+
+@pytest.mark.parametrize("entries", [1, 3, 64])
+def test_how_many_entries_lie_in_registers_does_not_matter(monkeypatch, entries):
+    monkeypatch.setattr(kernel, "SHORT", entries)
+    differ, hits = differences(small_scene(), "expanded")
+    assert differ == 0
+    assert hits > 0
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 33, 500])
+def test_rays_come_in_as_others_are_done(count):
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    rays = *(a[:count] for a in rays_at(scene, 500, 5)), np.full(count, np.inf, np.float32)
+    found = walked(interpreted, tracer, rays, options_of(tracer))
+    wanted = tracer.closest_hit(*rays[:2])
+    np.testing.assert_array_equal(found.name, wanted.face)
+    np.testing.assert_array_equal(found.t, wanted.t)
+
+
+def test_more_rays_than_are_counted_are_walked_in_parts(monkeypatch):
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    monkeypatch.setattr(kernel, "MOST_RAYS", 48)
+    for any_hit in (False, True):
+        assert differences_of(tracer, odd_rays(scene, 100), options_of(tracer, any_hit=any_hit))[0] == 0
+
+
+def test_what_is_sifted_out_is_not_hit():
+    """Edge functions of both signs, or of none: what the kernel leaves out, the exact test rejects."""
+    draw = np.random.default_rng(3)
+    corners = draw.normal(size=(3, 2, 20000)).astype(np.float32)
+    corners[:, :, :4000] = np.round(corners[:, :, :4000])
+    corners[:, :, 4000:5000] *= np.float32(3e19)
+    corners[0, 0, 5000:5100] = np.nan
+    x, y = (tuple(jax.numpy.asarray(corners[:, axis])) for axis in (0, 1))
+    flags = tiles.may_be_inside(*zip(x, y, strict=True), BY_INTERPRETER)
+    # As the GPU has it: products that are not a number stay so, and minima are of what is one.
+    gpus = {"product": lambda a, b: a * b, "smaller": jax.numpy.fmin, "larger": jax.numpy.fmax}
+    plain = BY_INTERPRETER._replace(sifting=BY_INTERPRETER.sifting._replace(**gpus))
+    sifted = np.asarray(tiles.may_be_inside(*zip(x, y, strict=True), plain))
+    heights = tuple(map(jax.numpy.ones_like, x))
+    t = np.asarray(crossing_of(Edges(*edge_functions(x, y), heights, np.bool_(True), y)))
+    hit = (t > 0) & np.isfinite(t)
+    assert (np.asarray(flags) | ~hit).all()
+    assert (sifted | ~hit).all()
+    assert 1000 < hit.sum() < sifted.sum() < 10000
 
 
 def test_nodes_of_sixteen_children_are_refused():
     scene = small_scene()
     tracer = Tracer(scene, device="cpu", threads=1, hierarchy="rebuilt")
-    ready = jax.jit(prepared_rays)(tracer._scene, *odd_rays(scene))
     with pytest.raises(NotImplementedError, match="nodes of 16 children"):
-        walked(partial(kernel.walk_rays, interpret=True), tracer, ready, options_of(tracer))
+        walked(interpreted, tracer, odd_rays(scene), options_of(tracer))
 
 
 def test_a_fault_in_the_kernel_would_be_seen(monkeypatch):
-    inexact = kernel.BY_INTERPRETER._replace(quotient=lambda a, b: a * (1 / b))
+    exact = kernel.BY_INTERPRETER.exact._replace(quotient=lambda a, b: a * (1 / b))
+    inexact = kernel.BY_INTERPRETER._replace(exact=exact)
     monkeypatch.setattr(kernel, "BY_INTERPRETER", inexact)
     differ, _ = differences(small_scene(), "expanded")
     assert differ > 0
@@ -151,8 +201,7 @@ def test_a_walk_in_a_circle_ends():
     children = nodes[0, 6].view(np.int32)
     children[children != DONE] = 0
     scene = layout.arrays._replace(nodes=nodes)
-    ready = jax.jit(prepared_rays)(scene, *odd_rays(small_scene()))
-    traced = jax.jit(partial(kernel.walk_rays, options=options_of(tracer), interpret=True))(scene, ready)
+    traced = jax.jit(partial(interpreted, options=options_of(tracer)))(scene, *odd_rays(small_scene()))
     assert (np.asarray(traced.name) == STUCK).any()
 
 
@@ -160,15 +209,55 @@ def test_more_nodes_than_an_entry_can_say_are_refused(monkeypatch):
     tracer = Tracer(small_scene(), device="cpu", threads=1)
     monkeypatch.setattr(kernel, "MOST_NODES", 8)
     with pytest.raises(NotImplementedError, match="8 nodes"):
-        kernel.walk_rays(tracer._scene, jax.numpy.zeros((4, 24)), options_of(tracer), interpret=True)
+        interpreted(tracer._scene, *odd_rays(small_scene()), options_of(tracer))
+
+
+def test_functions_of_arrays_go_by_the_kernel(monkeypatch):
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    asked = []
+
+    def by_kernel(*given):
+        asked.append(given[-1])
+        return interpreted(*given)
+
+    monkeypatch.setattr(kernel, "trace_rays", by_kernel)
+    geometry = functional.Geometry.of(tracer, scene.faces())
+    geometry = replace(geometry, options=geometry.options._replace(kernel=True))
+    origins, directions = rays_at(scene, 40, 2)
+    wanted = tracer.closest_hit(origins, directions)
+    hits = jax.jit(functional.closest_hit)(geometry, scene.positions, origins, directions)
+    np.testing.assert_array_equal(hits.t, wanted.t)
+    np.testing.assert_array_equal(hits.face, wanted.face)
+    by_pairs = [a.reshape(20, 2, 3) for a in (origins, directions)]
+    found = jax.vmap(functional.any_hit, (None, 0, 0))(geometry, *by_pairs)
+    np.testing.assert_array_equal(found.ravel(), wanted.hit)
+    assert {options.any_hit for options in asked} == {False, True}
+    before = len(asked)
+    # What is gathered, the twin walks.
+    counts = functional.count_hits(geometry, origins, directions)
+    np.testing.assert_array_equal(counts, tracer.count_hits(origins, directions))
+    assert len(asked) == before
+
+
+def test_functions_of_arrays_do_without_a_kernel_that_cannot_be_compiled():
+    scene = small_scene()
+    tracer = Tracer(scene, device="cpu", threads=1)
+    tracer._on_gpu = tracer._kernel = True
+    launch._refused.clear()
+    with pytest.warns(SlowTracingWarning, match="kernel cannot be compiled here"):
+        geometry = functional.Geometry.of(tracer, scene.faces())
+    assert geometry.options.batch
+    assert not geometry.options.kernel
+    launch._refused.clear()
 
 
 def lowered_for_cuda(tracer, options):
     """The program that a GPU would be given, made without one."""
-    ready = jax.ShapeDtypeStruct((4096, 24), np.float32)
+    rays = [jax.ShapeDtypeStruct(shape, np.float32) for shape in ((4096, 3), (4096, 3), (4096,))]
     device = AbstractDevice(device_kind="NVIDIA H100", num_cores=132, platform="gpu")
     with use_abstract_mesh(AbstractMesh((), (), abstract_device=device)):
-        traced = jax.jit(partial(kernel.walk_rays, options=options)).trace(tracer._scene, ready)
+        traced = jax.jit(partial(kernel.trace_rays, options=options)).trace(tracer._scene, *rays)
         return traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
@@ -181,7 +270,7 @@ def test_kernel_is_lowered_for_cuda(resident, any_hit):
 
 def test_what_triton_cannot_do_is_not_lowered(monkeypatch):
     tracer = Tracer(small_scene(), device="cpu", threads=1)
-    monkeypatch.setattr(kernel, "_over_lanes", lambda join, values: jax.numpy.sort(values, axis=1))
+    monkeypatch.setattr(kernel, "bits_in", lambda flags, bits: jax.numpy.sort(bits, axis=1)[:, 0])
     with pytest.raises(Exception, match="sort"):
         lowered_for_cuda(tracer, options_of(tracer))
 

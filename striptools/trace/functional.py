@@ -182,6 +182,11 @@ def _walked(walker: _Walker, origins: Array, directions: Array, reach: Array) ->
 def _traced(scene: Any, origins: Array, directions: Array, reach: Array, options: WalkOptions) -> Traced:
     if isinstance(scene, InstancedScene):
         return trace_in_place(scene, origins, directions, reach, options)
+    if options.kernel and options.gather is None:
+        # Here, so that a JAX without Pallas or its Triton does for all else.
+        from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
+
+        return trace_by_kernel(scene, origins, directions, reach, options)
     return trace_rays(scene, origins, directions, reach, options)
 
 

@@ -99,6 +99,14 @@ def _started(mesh: Mesh, options: WalkOptions, scene: WalkScene, *rays: Any) -> 
     return program(mesh, options._replace(kernel=False))(scene, *rays)
 
 
+def tried(mesh: Mesh, options: WalkOptions, scene: WalkScene) -> WalkOptions:
+    """The same options, without a kernel that cannot be compiled here: it is compiled, and that is said."""
+    if options.kernel:
+        rays = (np.zeros((TILES[0], 3), np.float32),) * 2
+        _started(mesh, options, scene, *rays, np.zeros(TILES[0], np.float32))
+    return options._replace(kernel=options.kernel and options not in _refused)
+
+
 def stream(
     scene: WalkScene, rays: Rays, mesh: Mesh, options: WalkOptions
 ) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:

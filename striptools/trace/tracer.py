@@ -23,7 +23,7 @@ from striptools.trace.device import DeviceKind, core_count, quiet_jax, trace_dev
 from striptools.trace.gathering import all_hits, check_ended, counts
 from striptools.trace.hit import AllHits, ClosestPoints, Hits
 from striptools.trace.instanced import InstancedLayout, InstanceNumbers, lay_out_instanced
-from striptools.trace.launch import device_mesh, replicate, stream
+from striptools.trace.launch import device_mesh, replicate, stream, tried
 from striptools.trace.layout import Found, Layout, Rays
 from striptools.trace.leaves import WideLayout, lay_out, lay_out_rebuilt
 from striptools.trace.memory import EXPANDED_BYTES, free_memory
@@ -490,7 +490,8 @@ class Tracer:
             layout, arrays = wide._layout, wide._layout.arrays
             if isinstance(layout, InstancedLayout):
                 arrays = arrays._replace(places=layout.places)
-            return jax.device_put(arrays, self.devices[0]), options
+            arrays = jax.device_put(arrays, self.devices[0])
+            return arrays, tried(device_mesh(self.devices[:1]), options, arrays)
 
     def _gatherer(self) -> "Tracer":
         """The tracer for more than closest and any hits, of nodes that have each triangle in one leaf.

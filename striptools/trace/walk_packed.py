@@ -115,15 +115,14 @@ class PackedScene(NamedTuple):
         at = index(node)
         planes = self._planes_of(at)
         head = self._row(self.nodes, at, 0, 4)
-        origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
-        shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
+        origins, shifts = self._grid(head)
         low, high = [], []
         for axis in range(3):
-            origin, shift = origins[axis].astype(jnp.int32), shifts[axis].astype(jnp.int32)
+            origin, shift = origins[axis], shifts[axis]
             near, far = ((origin + (planes[row] << shift)).astype(jnp.float32) for row in (axis, axis + 3))
             low.append(near * slab.inverse[axis] - slab.low[axis])
             high.append(far * slab.inverse[axis] - slab.high[axis])
-        return self._passes(low, high, limit) & (planes[0] <= planes[3])
+        return passes(low, high, limit) & (planes[0] <= planes[3])
 
     def boxes_of(self, node: Array) -> Array:
         """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
@@ -194,7 +193,7 @@ class PackedScene(NamedTuple):
         assert decode is not None
         # Behind a barrier, or XLA reads it anew for every use of it.
         header = self._settled(self._row(self.headers, where.block, 0, 8))
-        x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
+        x, y, z = self._decoded(header, where, axes_of(header, self.scale_exponent), decode)
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         return Leaf(ax, ay, az, first_corner(x, y, z), *self._named(where))
 
@@ -210,8 +209,8 @@ class PackedScene(NamedTuple):
 
         def decoded() -> tuple[list[Array], ...]:
             header = self._settled(self._once(self.headers, where.block))
-            described = _axes(header, self.scale_exponent)
-            chosen = [_Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
+            described = axes_of(header, self.scale_exponent)
+            chosen = [Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
             x, y, z = self._decoded(header, where, chosen, decode)
             return x, y, z
 
@@ -226,7 +225,7 @@ class PackedScene(NamedTuple):
         name = (where.block << 8 | ((where.said & 0xFF) + lane)).astype(jnp.int32)
         return lane <= (where.said >> 8 & 7), name
 
-    def _decoded(self, header: Any, where: "_Run", axes: list["_Axis"], decode: Decode) -> list[list[Array]]:
+    def _decoded(self, header: Any, where: "_Run", axes: list["Axis"], decode: Decode) -> list[list[Array]]:
         """Coordinates along axes of the corners a, b, c of a run's triangles, scaled."""
         corners = self._corners(header, where.said, decode.flips)
         return self._positions(header, corners, axes, decode)
@@ -260,6 +259,12 @@ class PackedScene(NamedTuple):
         triangle = self._at(self.headers, (block, np.uint32(0))) + place
         face = self._at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
         return jnp.where(names < 0, names, face)
+
+    def _grid(self, head: Any) -> tuple[list[Array], list[Array]]:
+        """Where planes are counted from and how far they are shifted, int32 along each axis."""
+        origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
+        shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
+        return [a.astype(jnp.int32) for a in origins], [a.astype(jnp.int32) for a in shifts]
 
     # What follows says how arrays are read; the walk on a GPU reads them in its own way.
 
@@ -310,10 +315,6 @@ class PackedScene(NamedTuple):
         """How many bits are set."""
         return lax.population_count(values)
 
-    def _passes(self, low: list[Array], high: list[Array], limit: Array) -> Array:
-        """As `box.passes`."""
-        return passes(low, high, limit)
-
     def _run_of(self, child: Array) -> "_Run":
         """The block of a leaf, and what is said of its run."""
         code = index(~child)
@@ -324,8 +325,8 @@ class PackedScene(NamedTuple):
         inner, below = head[3] >> 16 & 0xFF, (np.uint32(1) << slot) - 1
         bits = 8 * (slot & 3)
         under = (np.uint32(1) << bits) - 1
-        first = _used_bytes(low_x[0], high_x[0]) & jnp.where(slot < 4, under, ALL)
-        second = _used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
+        first = used_bytes(low_x[0], high_x[0]) & jnp.where(slot < 4, under, ALL)
+        second = used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
         rank = self._ones(first | second >> 1) - self._ones(inner & below)
         block = head[1] & BLOCK_BITS
         said = self._once(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
@@ -336,8 +337,7 @@ class PackedScene(NamedTuple):
         word, counts = header[1], header[2]
         triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1
         lane = self._lanes()
-        first = run & 0xFF
-        place = first + 2 * (run >> 11 & 0xFF) + 1
+        first, place = run & 0xFF, first_place(run)
 
         # The far corner is what the last other turn left behind.
         turns = run >> 19 & 0xFF
@@ -345,9 +345,8 @@ class PackedScene(NamedTuple):
         other = jnp.where(turned, ~turns, turns) & ((np.uint32(2) << lane) - 1)
         last = 31 - _leading_zeros(other)
 
-        width = 32 - _leading_zeros(counts >> 8 & 0xFF)
+        indices, width = index_stream(header)
         mask = (np.uint32(1) << width) - 1
-        indices = (2 + has_flips) * triangles
         near = self._windows(word, indices + place * width, width * lane)
         far = self._windows(word, indices + place * width, width * jnp.where(other == 0, 0, last))
         before = self._windows(word, indices + (place - (run >> 27)) * width, np.uint32(0), 2)
@@ -373,13 +372,12 @@ class PackedScene(NamedTuple):
         return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
-        self, header: Any, corners: tuple[Array, Array, Array], axes: list["_Axis"], decode: Decode
+        self, header: Any, corners: tuple[Array, ...], axes: list["Axis"], decode: Decode
     ) -> list[list[Array]]:
         """Scaled coordinates of the corners along axes, (8,) float32 each."""
         counts = header[2]
-        triangles, strips, has_flips = (counts & 0xFF) + 1, (counts >> 16 & 0xFF) + 1, counts >> 24 & 1
-        index_width = 32 - _leading_zeros(counts >> 8 & 0xFF)
-        vertices = (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
+        indices, index_width = index_stream(header)
+        vertices = indices + ((counts & 0xFF) + 2 * (counts >> 16 & 0xFF) + 3) * index_width
         stride = axes[0].width + axes[1].width + axes[2].width
         found = []
         for corner in corners:
@@ -403,7 +401,7 @@ class _Run(NamedTuple):
     said: Array
 
 
-class _Axis(NamedTuple):
+class Axis(NamedTuple):
     """How a block's coordinates on an axis are written: () each."""
 
     offset: Any
@@ -414,7 +412,18 @@ class _Axis(NamedTuple):
     scale_exponent: Array
 
 
-def _axes(header: Array, scale_exponent: Array) -> list[_Axis]:
+def first_place(said: Array) -> Array:
+    """Of a run described: the place of its first triangle's near corner among a block's indices."""
+    return (said & 0xFF) + 2 * (said >> 11 & 0xFF) + 1
+
+
+def index_stream(header: Any) -> tuple[Array, Array]:
+    """Where among a block's bits the indices of its vertices begin, and the bits of one."""
+    counts = header[2]
+    return (2 + (counts >> 24 & 1)) * ((counts & 0xFF) + 1), 32 - _leading_zeros(counts >> 8 & 0xFF)
+
+
+def axes_of(header: Any, scale_exponent: Array) -> list[Axis]:
     """The three axes of a block; the exponent is that of the scaled coordinates."""
     described = header[6], header[6] >> 8, header[6] >> 16
     exponents = header[6] >> 24, header[7] & 0xFF, header[7] >> 8 & 0xFF
@@ -423,12 +432,12 @@ def _axes(header: Array, scale_exponent: Array) -> list[_Axis]:
     for axis in range(3):
         width, mode = described[axis] & 63, described[axis] >> 6 & 3
         exponent = exponents[axis].astype(jnp.int32) - 149 + scale_exponent
-        axes.append(_Axis(offset, width, mode, header[3 + axis], exponent, scale_exponent))
+        axes.append(Axis(offset, width, mode, header[3 + axis], exponent, scale_exponent))
         offset = offset + width
     return axes
 
 
-def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
+def _coordinate(vertex: list[Array], axis: Axis, decode: Decode) -> Array:
     """One scaled coordinate of (8,) vertices, from the words that they begin."""
     place, shift = axis.offset >> 5, axis.offset & 31
     padded = [*vertex, jnp.zeros_like(vertex[0])]
@@ -449,7 +458,7 @@ def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
         bits = whole ^ (whole >> 31 & 0x7FFFFFFF)
         value = jnp.where(axis.mode == 2, lax.bitcast_convert_type(bits, jnp.float32), value)
         exponent = jnp.where(axis.mode == 2, axis.scale_exponent, exponent)
-    return value * _power_of_two(exponent)
+    return value * power_of_two(exponent)
 
 
 def _from_bits(whole: Array, scale_exponent: Array) -> Array:
@@ -465,7 +474,7 @@ def _from_bits(whole: Array, scale_exponent: Array) -> Array:
 def _scaled(number: Array, exponent: Array) -> Array:
     """A number times a power of two, in two steps since one may be out of range; zero where denormal."""
     first = jnp.clip(exponent, -126, 127)
-    value = number * _power_of_two(first) * _power_of_two(jnp.clip(exponent - first, -126, 127))
+    value = number * power_of_two(first) * power_of_two(jnp.clip(exponent - first, -126, 127))
     return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, np.float32(0), value)
 
 
@@ -515,12 +524,12 @@ def _leading_zeros(a: Array) -> Array:
     return lax.clz(a.astype(jnp.int32)).astype(jnp.uint32)
 
 
-def _power_of_two(exponent: Array) -> Array:
+def power_of_two(exponent: Array) -> Array:
     """2**exponent, exponent (int32) from -126 to 127."""
     return lax.bitcast_convert_type((exponent + 127) << 23, jnp.float32)
 
 
-def _used_bytes(low: Array, high: Array) -> Array:
+def used_bytes(low: Array, high: Array) -> Array:
     """The top bit of each byte but of those where low is 1 and high is 0: four slots that are not empty."""
     other = (low ^ 0x01010101) | high
     return ((other & 0x7F7F7F7F) + 0x7F7F7F7F | other) & np.uint32(0x80808080)

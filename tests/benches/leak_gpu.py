@@ -13,7 +13,7 @@ from striptools.trace.layout import Rays
 from striptools.trace.pallas import walk as kernel
 from striptools.trace.streams import Take
 from striptools.trace.tracer import ResidentKind
-from striptools.trace.walk import Traced, WalkOptions, WalkScene, prepared_rays, walk_rays
+from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
 
 RAYS_AT_ONCE = (2**8, 2**12)
 
@@ -55,5 +55,5 @@ def _program(by_kernel: bool, options: WalkOptions) -> Any:
 
 
 def _walked(scene: WalkScene, *rays: Any, by_kernel: bool, options: WalkOptions) -> Traced:
-    walk = partial(kernel.walk_rays, interpret=True) if by_kernel else walk_rays
-    return walk(scene, prepared_rays(scene, *rays), options)
+    trace = partial(kernel.trace_rays, interpret=True) if by_kernel else trace_rays
+    return trace(scene, *rays, options)

@@ -1,15 +1,16 @@
 """The walk of `trace.walk` as one GPU kernel: its twin is `walk.walk_rays` with `WalkOptions.batch`.
 
-Order of visits, boxes left out, hits and ties are the twin's, and so are all results, bit for bit.
+Aila & Laine, "Understanding the Efficiency of Ray Traversal on GPUs" (HPG 2009): a ray a thread, and rays
+that are done are replaced. Nodes and the order of visits are the twin's; boxes are left out later or sooner
+than there, which changes no result: hits and ties are, bit for bit.
 
 Differences:
 
-1. A warp walks four rays, eight lanes each (`tiles`): a child's box and a triangle are tested by a thread
-   apiece, and a row of a node or a leaf is one read of 32 neighbouring bytes. One ray a thread would read
-   scattered memory, wait for the slowest of 32 rays and not for that of four, and keep its stack in memory.
-2. The stack lies in registers, an entry a lane: to push is a select, to pop a sum over the lanes.
-3. What a ray has to itself stands in each of its lanes; nothing is exchanged but in sums, minima and maxima
-   over lanes.
+1. Rays at inner nodes go on until as many wait at leaves; new ones come in once most of a warp's are done.
+2. Which warp walks a ray depends on who was quick; what a ray hits does not.
+3. A leaf's triangles are sifted by the signs of their edge functions, exact but for what the twin does with
+   numbers that are none. What is left, one triangle of a ray at a time, is tested as the twin does.
+4. The stack's upper entries lie in registers and move as a whole; the rest, which few trees need, in memory.
 
 JAX 0.11 calls Pallas' Triton deprecated: where it is gone, `launch` says so and the twin walks.
 """
@@ -25,48 +26,69 @@ from jax import Array, lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from striptools.trace.box import Slab
-from striptools.trace.numerics import BY_XLA, Arithmetic, in_range
-from striptools.trace.pallas.arithmetic import BY_TRITON
-from striptools.trace.pallas.tiles import Source, Tile, lane_numbers, source_of
+from striptools.trace.numerics import in_range
+from striptools.trace.pallas.arithmetic import BY_INTERPRETER, BY_TRITON, KernelArithmetic
+from striptools.trace.pallas.tiles import (
+    HALF,
+    RAYS,
+    Sides,
+    Source,
+    Tile,
+    bits_in,
+    each,
+    frame_at,
+    frame_words,
+    lane_numbers,
+    source_of,
+    three,
+)
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     DONE,
-    FLOATS,
     HIT,
     MISS,
-    NO_NAME,
     SLACK,
     STUCK,
     WIDTH,
+    Frame,
     Traced,
     WalkOptions,
     WalkScene,
-    prepared_rays,
+    ready_words,
 )
 
-RAYS = 4
-"""Rays of a program, which is a warp: eight threads each."""
+PROGRAMS = 4096
+"""Programs, at most: as many as a GPU can have at work, or more."""
+
+REPLACED = 24
+"""Rays that are done before others take their places."""
+
+SHORT = 8
+"""Entries of the stack in registers."""
+
+MOST_RAYS = 2**23
+"""Rays are counted in float32."""
 
 MOST_NODES = 2**23
 """A node and the lanes left of it are one entry of 32 bits, its sign unused."""
 
-BY_INTERPRETER = BY_XLA._replace(quotient=lax.div)
-
 
 def trace_rays(
-    scene: WalkScene, origins: Array, directions: Array, t_max: Array, options: WalkOptions
+    scene: WalkScene,
+    origins: Array,
+    directions: Array,
+    t_max: Array,
+    options: WalkOptions,
+    *,
+    interpret: bool = False,
 ) -> Traced:
-    """Trace rays as `walk.trace_rays` does, walking them by the kernel."""
-    return walk_rays(scene, prepared_rays(scene, origins, directions, t_max), options)
-
-
-def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, *, interpret: bool = False) -> Traced:
-    """Walk r rays, r a multiple of `RAYS`, as `walk.walk_rays` does.
+    """Trace rays as `walk.trace_rays` does, by the kernel.
 
     Args:
         scene: Wide or packed, of fewer than `MOST_NODES` nodes of eight children.
-        ready: (r, 24) float32, as from `walk.prepared_rays`.
+        origins: (r, 3) float32.
+        directions: (r, 3) float32.
+        t_max: (r,) float32.
         options: What to compile in: nothing counted or gathered; `interleave` and `batch` do not matter.
         interpret: Run the kernel by JAX on the platform at hand, slowly.
 
@@ -77,82 +99,115 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, *, interpret
         raise NotImplementedError(f"nodes of {scene.width} children")
     if scene.node_count > MOST_NODES:
         raise NotImplementedError(f"more than {MOST_NODES} nodes")
-    count, source = len(ready), source_of(scene)
-    results = [jax.ShapeDtypeStruct((count,), kind) for kind in (np.float32, np.int32)]
-    arithmetic = BY_INTERPRETER if interpret else BY_TRITON
-    t, name = pl.pallas_call(
-        partial(_kernel, source=source, scene=scene, options=options, arithmetic=arithmetic),
-        grid=(count // RAYS,),
+    ranges = [slice(k, k + MOST_RAYS) for k in range(0, max(1, len(t_max)), MOST_RAYS)]
+    parts = [
+        _traced(scene, origins[part], directions[part], t_max[part], options, interpret=interpret)
+        for part in ranges
+    ]
+    return Traced(*map(jnp.concatenate, zip(*parts, strict=True))) if len(parts) > 1 else parts[0]
+
+
+def _traced(
+    scene: WalkScene,
+    origins: Array,
+    directions: Array,
+    t_max: Array,
+    options: WalkOptions,
+    *,
+    interpret: bool,
+) -> Traced:
+    """The same for rays that one kernel takes."""
+    count, source = len(t_max), source_of(scene)
+    if count == 0:
+        return _results(jnp.zeros(0, np.int32), t_max)
+    programs = min(PROGRAMS, -(-count // RAYS))
+    taken = jnp.zeros(RAYS, np.float32)
+    given = [*source.arrays, frame_words(scene.frame), origins, directions, t_max, taken]
+    results = [jax.ShapeDtypeStruct((RAYS,), np.float32), jax.ShapeDtypeStruct((count,), np.int32)]
+    if not options.any_hit:
+        results.append(jax.ShapeDtypeStruct((count,), np.float32))
+    if options.stack_size > SHORT:
+        results.append(jax.ShapeDtypeStruct((programs, options.stack_size - SHORT, RAYS), np.int32))
+    _, name, *rest = pl.pallas_call(
+        partial(_kernel, source=source, scene=scene, options=options, interpret=interpret),
+        grid=(programs,),
         out_shape=results,
         compiler_params=plgpu.CompilerParams(num_warps=1, num_stages=1),
+        input_output_aliases={len(given) - 1: 0},
         interpret=interpret,
         name="walk",
-    )(*source.arrays, ready)
-    counters, counted = jnp.zeros((count, 0), np.int32), jnp.zeros(0, np.int32)
-    return Traced(jnp.zeros(0) if options.any_hit else t, name, counters, counted)
+    )(*given)
+    return _results(name, None if options.any_hit else rest[0])
 
 
-def _kernel(
-    *refs: Any, source: Source, scene: WalkScene, options: WalkOptions, arithmetic: Arithmetic
-) -> None:
-    """Walk the rays of one program and write what they hit."""
-    shape = (RAYS, WIDTH)
+def _results(name: Array, t: Array | None) -> Traced:
+    nothing = jnp.zeros(0)
+    counters = jnp.zeros((len(name), 0), np.int32)
+    return Traced(nothing if t is None else t, name, counters, nothing.astype(np.int32))
+
+
+def _kernel(*refs: Any, source: Source, scene: WalkScene, options: WalkOptions, interpret: bool) -> None:
+    """Walk rays as long as there are any and write what they hit."""
+    arithmetic = BY_INTERPRETER if interpret else BY_TRITON
     given = len(source.arrays)
-    ready, results = refs[given], refs[given + 1 :]
-    row = pl.program_id(0) * RAYS + lax.broadcasted_iota(np.int32, shape, 0)
-    tile = source.tile(list(refs[:given]), shape, arithmetic)
-    ray = _ray_at(ready, row)
-    walk = _Walk(tile, ray, options, arithmetic, RAYS * scene.node_count, scene.has_faces)
-    for ref, values in zip(results, walk.walked(), strict=True):
-        # Every lane writes the same.
-        plgpu.store(ref.at[row], values)
+    frame, origins, directions, t_max, _, taken, name, *results = refs[given:]
+    spilled = results[-1] if options.stack_size > SHORT else None
+    tile = source.tile(list(refs[:given]), arithmetic)
+    t = None if options.any_hit else results[0]
+    memory = _Memory(frame_at(frame), origins, directions, t_max, taken, name, t)
+    rest = options, arithmetic, scene.node_count, scene.has_faces
+    _Walk(tile, memory, spilled, pl.program_id(0), *rest).walk_all()
+
+
+class _Memory(NamedTuple):
+    """Where rays come from and results go: references."""
+
+    frame: Frame
+    origins: Any
+    directions: Any
+    t_max: Any
+    taken: Any
+    name: Any
+    t: Any = None
 
 
 class _Ray(NamedTuple):
-    """What `walk.ReadyRay` holds, a tile apiece."""
+    """What `walk.ReadyRay` holds, an array (rays,) each."""
 
-    slab: Slab
+    sides: Sides
     shear: Shear
-    t_max: Array
     t_unit: Array
     mirror: Array
-    child: Array
-    lanes: Array
-
-
-def _ray_at(ready: Any, row: Array) -> _Ray:
-    """Read rays, laid out as `walk.ReadyRay` says."""
-    words = [plgpu.load(ready.at[row, k]) for k in range(FLOATS + 6)]
-    floats, ints = words[:FLOATS], [lax.bitcast_convert_type(word, np.int32) for word in words[FLOATS:]]
-    slab = Slab(floats[0:3], floats[3:6], floats[6:9])  # pyright: ignore[reportArgumentType]
-    shear = Shear(
-        (ints[0], ints[1], ints[2]), (floats[9], floats[10], floats[11]), floats[12], floats[13], floats[14]
-    )
-    return _Ray(slab, shear, floats[15], floats[16], ints[3], ints[4] ^ DONE, ints[5])
 
 
 class _State(NamedTuple):
-    """Where rays are, as `walk.Place`, their stacks, and their closest hits by lane.
+    """Where rays are, (rays,) each but the last two, () int32.
 
     Attributes:
-        stack: Tiles of entries, `node << 8 | lanes`: lane k of tile s holds entry 8s + k.
-        turns: () int32, of the loops.
+        row: Which rays they are; `_Walk.nowhere` where there is none.
+        ray: What stays the same along a walk.
+        child: As of `walk.Place`, and so are `node` and `lanes`.
+        visits: Nodes visited.
+        height: Entries of the stack, where some may lie in memory.
+        stack: Its upper `SHORT` entries, the top first: `node << 8 | lanes`, 0 where there is none.
+        nearest: The closest hit's t.
+        name: Its name.
+        fresh: A ray that some program took, and with it all before.
+        census: How many rays are at an inner node, and 2**16 times how many at a leaf.
     """
 
+    row: Array
+    ray: _Ray
     child: Array
     node: Array
     lanes: Array
-    height: Array
+    visits: Array
+    height: Array | None
     stack: tuple[Array, ...]
     nearest: Array
-    t: Array
     name: Array
-    turns: Any
-
-
-def _over_lanes(join: Any, values: Array) -> Array:
-    """A reduction over each ray's lanes, in all of them."""
-    return jnp.broadcast_to(join(values, axis=1, keepdims=True), values.shape)
+    fresh: Any
+    census: Any
 
 
 @dataclass(frozen=True)
@@ -160,82 +215,242 @@ class _Walk:
     """The steps of the walk of one program's rays."""
 
     tile: Tile
-    ray: _Ray
+    memory: _Memory
+    spilled: Any
+    program: Any
     options: WalkOptions
-    arithmetic: Arithmetic
-    bound: int
+    arithmetic: KernelArithmetic
+    node_count: int
     has_faces: bool
 
-    def walked(self) -> list[Array]:
-        """T and name."""
-        state = lax.while_loop(lambda s: self.goes_on(s, int(DONE) + 1), self.nodes_then_leaves, self.start())
-        name = self.closest_name(state)
-        t = in_range(self.arithmetic.product(state.nearest, self.ray.t_unit))
-        t = jnp.where(name < 0, np.float32(np.inf), t)
-        return [t, jnp.where(state.child != DONE, STUCK, name)]
+    @property
+    def nowhere(self) -> int:
+        """Behind the last ray: not negative, which to JAX is a place from the end."""
+        return self.memory.name.shape[0]
+
+    def walk_all(self) -> None:
+        """Walk until there is no ray left."""
+        state = lax.while_loop(self.goes_on, self.step, self.start())
+        self.write_down(state, state.row < self.nowhere)
 
     def start(self) -> _State:
-        ray = self.ray
-        zeros = jnp.zeros_like(ray.child)
-        tiles = -(-self.options.stack_size // WIDTH)
-        missed = jnp.full_like(zeros, MISS)
-        rest = (zeros, ray.lanes, zeros, (zeros,) * tiles, ray.t_max, ray.t_max, missed, np.int32(0))
-        return _State(ray.child, *rest)
+        """No ray yet."""
+        zeros, zero = jnp.zeros(RAYS, np.int32), jnp.zeros(RAYS, np.float32)
+        nowhere, none = three([zero] * 3), three([zeros] * 3)
+        sides = Sides(nowhere, nowhere, nowhere, none, none)
+        ray = _Ray(sides, Shear(none, nowhere, zero, zero, zero), zero, zeros)
+        entries = min(SHORT, self.options.stack_size)
+        height = None if self.spilled is None else zeros
+        rest = (zeros, zeros, zeros, height, (zeros,) * entries, zero, jnp.full_like(zeros, MISS))
+        row, child = jnp.full_like(zeros, self.nowhere), jnp.full_like(zeros, DONE)
+        return _State(row, ray, child, *rest, np.int32(0), np.int32(0))
 
-    def goes_on(self, state: _State, least: int) -> Array:
-        """Whether any ray's next child is at least that, and the walk within its bound."""
-        return (jnp.max(state.child.reshape(-1)) >= np.int32(least)) & (state.turns <= self.bound)
+    def goes_on(self, state: _State) -> Array:
+        """Whether a ray is on its way or to come."""
+        return (state.census != 0) | (state.fresh < self.nowhere)
 
-    def nodes_then_leaves(self, state: _State) -> _State:
-        state = lax.while_loop(lambda s: self.goes_on(s, 0), self.visit_nodes, state)
-        return self.visit_leaves(state)
+    def step(self, state: _State) -> _State:
+        """New rays come in; those at nodes go on; those at leaves test them."""
+        state = lax.cond(self.takes(state), self.take, lambda s: s, state)
+        state = lax.while_loop(self.is_among_nodes, self.visit_nodes, state)
+        return lax.cond(_at_leaves(state) >= _at_nodes(state), self.visit_leaves, lambda s: s, state)
+
+    def takes(self, state: _State) -> Array:
+        """Whether new rays come in."""
+        done = RAYS - _at_nodes(state) - _at_leaves(state)
+        return (state.fresh < self.nowhere) & ((done >= REPLACED) | (state.census == 0))
+
+    def is_among_nodes(self, state: _State) -> Array:
+        """Whether more rays are at nodes than at leaves, and none are to come in."""
+        return (_at_nodes(state) > _at_leaves(state)) & ~self.takes(state)
+
+    # Rays come and go.
+
+    def take(self, state: _State) -> _State:
+        """Write down what rays that are done have found, and let new ones take their places."""
+        done = state.child == DONE
+        self.write_down(state, done & (state.row < self.nowhere))
+        count = jnp.where(done, np.int32(1), np.int32(0))
+        first = self.taken(jnp.sum(count))
+        row = first - 1 + lax.cumsum(count)
+        new = done & (row < self.nowhere)
+        ray, limit, child = self.ray_at(row, new)
+        # A ray that is none is done at once, and what the one before it found is written down no more.
+        merged = jax.tree.map(lambda a, b: jnp.where(done, a, b), ray, state.ray)
+        zeros = jnp.zeros_like(row)
+        return self.counted(
+            state._replace(
+                row=jnp.where(done, jnp.where(new, row, self.nowhere), state.row),
+                ray=merged,
+                child=jnp.where(done, jnp.where(new, child, DONE), state.child),
+                lanes=jnp.where(done, zeros, state.lanes),
+                visits=jnp.where(done, zeros, state.visits),
+                height=None if state.height is None else jnp.where(done, zeros, state.height),
+                stack=tuple(jnp.where(done, zeros, entry) for entry in state.stack),
+                nearest=jnp.where(done, limit, state.nearest),
+                name=jnp.where(done, MISS, state.name),
+                fresh=first + jnp.sum(count),
+            )
+        )
+
+    def taken(self, count: Array) -> Array:
+        """The first of so many rays, () int32, that no other program takes."""
+        # An atomic operation of a thread alone would make the GPU set memory aside that its cache lacks then.
+        lane = lax.broadcasted_iota(np.int32, (RAYS,), 0)
+        # Of float32, since JAX adds whole numbers of many threads as if they were such.
+        several = jnp.broadcast_to(count, lane.shape).astype(np.float32)
+        before = plgpu.atomic_add(self.memory.taken, (lane,), several).astype(np.int32)
+        return jnp.sum(jnp.where(lane == 0, before, np.int32(0)))
+
+    def ray_at(self, row: Array, mask: Array) -> tuple[_Ray, Array, Array]:
+        """Rays made ready, how far they reach, and the child that each visits first: the root, or `DONE`."""
+        origin, direction = (
+            three(plgpu.load(ref.at[row, np.int32(k)], mask=mask) for k in range(3))
+            for ref in (self.memory.origins, self.memory.directions)
+        )
+        t_max = plgpu.load(self.memory.t_max.at[row], mask=mask)
+        divided = self.arithmetic.exact.quotient
+        floats, ints = ready_words(self.memory.frame, origin, direction, t_max, divided)
+        low, high, inverse = floats[0:3], floats[3:6], floats[6:9]
+        up = [(ints[3] >> axis & 1) != 0 for axis in range(3)]
+        sides = Sides(
+            three(-jnp.where(*each) for each in zip(up, low, high, strict=True)),
+            three(-jnp.where(*each) for each in zip(up, high, low, strict=True)),
+            three(inverse),
+            three(jnp.where(up[axis], np.int32(axis), np.int32(axis + 3)) for axis in range(3)),
+            three(jnp.where(up[axis], np.int32(axis + 3), np.int32(axis)) for axis in range(3)),
+        )
+        shear = Shear(three(ints[0:3]), three(floats[9:12]), floats[12], floats[13], floats[14])
+        return _Ray(sides, shear, floats[16], ints[3]), floats[15], ints[4] ^ DONE
+
+    def write_down(self, state: _State, mask: Array) -> None:
+        """Write what rays have found."""
+        stuck = state.visits > self.node_count
+        plgpu.store(self.memory.name.at[state.row], jnp.where(stuck, STUCK, state.name), mask=mask)
+        if self.memory.t is not None:
+            t = in_range(self.arithmetic.exact.product(state.nearest, state.ray.t_unit))
+            t = jnp.where(state.name < 0, np.float32(np.inf), t)
+            plgpu.store(self.memory.t.at[state.row], t, mask=mask)
+
+    def counted(self, state: _State) -> _State:
+        """The same, the census taken."""
+        at_leaf = (state.child < 0) & (state.child != DONE)
+        share = jnp.where(state.child >= 0, np.int32(1), jnp.where(at_leaf, np.int32(1 << 16), np.int32(0)))
+        return state._replace(census=jnp.sum(share))
+
+    # Nodes.
 
     def visit_nodes(self, state: _State) -> _State:
         """Each ray that is at an inner node visits it."""
         at_node = state.child >= 0
-        tile = self.tile.among(at_node)
-        met = tile.lanes_met(state.child, self.ray.slab, state.nearest * SLACK)
-        lane = lane_numbers(met.shape, np.int32)
-        lane_bits = jnp.int32(1) << (lane ^ self.ray.mirror)
-        lanes = _over_lanes(jnp.sum, jnp.where(met & at_node, lane_bits, 0))
-        top = self.top_of(state)
-
-        # Put what is left of the last node on the stack where this one has lanes.
-        into = lanes != 0
-        put = into & (state.lanes != 0)
-        entry = state.node << WIDTH | state.lanes
-        place = jnp.where(put, state.height - lane, -1)
-        stack = tuple(jnp.where(place == WIDTH * k, entry, tile) for k, tile in enumerate(state.stack))
+        # Rays that are at none read the root.
+        node = lax.max(state.child, np.int32(0))
+        met = jnp.zeros_like(node)
+        for half, there in enumerate(self.tile.lanes_met(node, state.ray.sides, state.nearest * SLACK)):
+            lanes = lane_numbers() + np.int32(HALF * half)
+            met = met | bits_in(there, np.int32(1) << (lanes ^ each(state.ray.mirror)))
+        # A walk in a circle ends: a ray visits each node once.
+        visits = jnp.where(at_node, state.visits + 1, state.visits)
+        met = jnp.where(at_node & (visits <= self.node_count), met, 0)
+        into = met != 0
+        state = self.pushed(state, into & (state.lanes != 0), state.node << WIDTH | state.lanes)
         state = state._replace(
             node=jnp.where(into, state.child, state.node),
-            lanes=jnp.where(into, lanes, state.lanes),
-            height=jnp.where(put, state.height + 1, state.height),
-            stack=stack,
-            turns=state.turns + 1,
+            lanes=jnp.where(into, met, state.lanes),
+            visits=visits,
         )
-        return self.next_child(state, at_node, top)
+        return self.counted(self.next_child(state, at_node))
+
+    def next_child(self, state: _State, active: Array) -> _State:
+        """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
+        state, top = self.popped(state, active & (state.lanes == 0))
+        node = jnp.where(active & (state.lanes == 0), top >> WIDTH, state.node)
+        lanes = jnp.where(active & (state.lanes == 0), top & 255, state.lanes)
+        some = active & (lanes != 0)
+        order = (31 - lax.clz(lanes)) & 7
+        found = self.tile.among(some).child_of(node, order ^ state.ray.mirror)
+        return state._replace(
+            child=jnp.where(active, jnp.where(some, found, DONE), state.child),
+            node=node,
+            lanes=jnp.where(some, lanes ^ (np.int32(1) << order), lanes),
+        )
+
+    def pushed(self, state: _State, mask: Array, entry: Array) -> _State:
+        """Put an entry on the stacks of some rays."""
+        stack = state.stack
+        if state.height is not None:
+            # Nothing is written behind the stack, whatever a damaged scene makes of it.
+            room = self.options.stack_size
+            full = mask & (state.height >= SHORT) & (state.height < room)
+            lax.cond(_any(full), partial(self.spill, state, full), lambda: None)
+            height = lax.min(state.height + 1, np.int32(room))
+            state = state._replace(height=jnp.where(mask, height, state.height))
+        moved = (entry, *stack[:-1])
+        return state._replace(stack=tuple(jnp.where(mask, a, b) for a, b in zip(moved, stack, strict=True)))
+
+    def popped(self, state: _State, mask: Array) -> tuple[_State, Array]:
+        """Take the top entry off the stacks of some rays; 0, which has no lane, where there is none."""
+        stack = state.stack
+        last = jnp.zeros_like(stack[0])
+        if state.height is not None:
+            deep = mask & (state.height > SHORT)
+            last = lax.cond(_any(deep), partial(self.unspill, state, deep), lambda: last)
+            state = state._replace(
+                height=jnp.where(mask & (state.height > 0), state.height - 1, state.height)
+            )
+        moved = (*stack[1:], last)
+        after = tuple(jnp.where(mask, a, b) for a, b in zip(moved, stack, strict=True))
+        return state._replace(stack=after), stack[0]
+
+    def spill(self, state: _State, mask: Array) -> None:
+        """Write the lowest entry in registers to memory."""
+        assert state.height is not None
+        plgpu.store(self._spilled_at(state.height - SHORT), state.stack[-1], mask=mask)
+
+    def unspill(self, state: _State, mask: Array) -> Array:
+        """Read the uppermost entry in memory."""
+        assert state.height is not None
+        return plgpu.load(self._spilled_at(state.height - SHORT - 1), mask=mask, other=0)
+
+    def _spilled_at(self, place: Array) -> Any:
+        return self.spilled.at[self.program, place, lax.broadcasted_iota(np.int32, (RAYS,), 0)]
+
+    # Leaves.
 
     def visit_leaves(self, state: _State) -> _State:
-        """Each ray that is at a leaf tests its triangles."""
+        """Each ray that is at a leaf tests its triangles and goes on."""
         at_leaf = (state.child < 0) & (state.child != DONE)
         tile = self.tile.among(at_leaf)
-        leaf = tile.leaf_of(self.ray.shear.axes, tile.find_leaf(state.child), self.options.decode)
-        t, name = leaf.crossings(self.ray.shear, self.arithmetic), leaf.name
-        there = at_leaf & (t > 0)
-        closer = there & ((t < state.t) | self.wins_ties(there & (t == state.t), name, state.name))
-        t = jnp.where(closer, t, state.t)
-        nearest = _over_lanes(jnp.min, t)
-        top = self.top_of(state)
-        state = state._replace(nearest=nearest, t=t, name=jnp.where(closer, name, state.name))
-        state = self.next_child(state, at_leaf, top)
+        where = tile.find_leaf(jnp.where(at_leaf, state.child, -1))
+        crossed = tile.lanes_crossed(state.ray.shear, where, self.options.decode)
+        crossed = jnp.where(at_leaf, crossed, 0)
+        test = partial(self.test_triangle, where)
+        state, _ = lax.while_loop(lambda carried: _any(carried[1] != 0), test, (state, crossed))
+        state = self.next_child(state, at_leaf)
         if self.options.any_hit:
-            state = state._replace(child=jnp.where(nearest < self.ray.t_max, DONE, state.child))
-        return state
+            found = at_leaf & (state.name >= 0)
+            state = state._replace(child=jnp.where(found, DONE, state.child))
+        return self.counted(state)
 
-    def wins_ties(self, tied: Array, name: Array, other: Array) -> Array:
+    def test_triangle(self, where: Any, carried: tuple[_State, Array]) -> tuple[_State, Array]:
+        """Each ray that has a triangle left to test tests one."""
+        state, crossed = carried
+        some = crossed != 0
+        lane = (31 - lax.clz(crossed)) & 7
+        leaf = self.tile.among(some).triangle_of(state.ray.shear.axes, where, lane, self.options.decode)
+        t = leaf.crossings(state.ray.shear, self.arithmetic.exact)
+        there = some & (t > 0)
+        closer = there & (t < state.nearest)
+        if not self.options.any_hit:
+            closer = closer | self.wins_tie(there & (t == state.nearest), leaf.name, state.name)
+        name = jnp.full_like(leaf.name, HIT) if self.options.any_hit else leaf.name
+        state = state._replace(
+            nearest=jnp.where(closer, t, state.nearest), name=jnp.where(closer, name, state.name)
+        )
+        return state, jnp.where(some, crossed ^ (np.int32(1) << lane), 0)
+
+    def wins_tie(self, tied: Array, name: Array, other: Array) -> Array:
         """Where t is the same: whether the face is less."""
-        if self.options.any_hit:
-            return jnp.zeros_like(tied)
         if not self.has_faces:
             return tied & (name < other)
 
@@ -245,62 +460,40 @@ class _Walk:
 
         return lax.cond(_any(tied), by_face, lambda: tied)
 
-    def top_of(self, state: _State) -> Array:
-        """The entry on top of the stack; 0, which is no lane, where there is none."""
-        place = state.height - 1 - lane_numbers(state.child.shape, np.int32)
-        found = jnp.zeros_like(state.child)
-        for k, tile in enumerate(state.stack):
-            found = jnp.where(place == WIDTH * k, tile, found)
-        return _over_lanes(jnp.sum, found)
 
-    def next_child(self, state: _State, active: Array, top: Array) -> _State:
-        """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
-        pop = active & (state.lanes == 0)
-        node = jnp.where(pop, top >> WIDTH, state.node)
-        lanes = jnp.where(pop, top & 255, state.lanes)
-        some = lanes != 0
-        order = (31 - lax.clz(lanes)) & 7
-        found = self.tile.among(active & some).child_of(node, order ^ self.ray.mirror)
-        child = jnp.where(active, jnp.where(some, found, DONE), state.child)
-        left = jnp.where(active & some, lanes ^ (jnp.int32(1) << order), lanes)
-        return state._replace(
-            child=child, node=node, lanes=left, height=jnp.where(pop & some, state.height - 1, state.height)
-        )
+def _at_nodes(state: _State) -> Array:
+    return state.census & 0xFFFF
 
-    def closest_name(self, state: _State) -> Array:
-        """Of the lanes that hold the closest hit, the name of the least face; `MISS` where there is none.
 
-        Of any hit `HIT`.
-        """
-        if self.options.any_hit:
-            return jnp.where(state.nearest < self.ray.t_max, HIT, MISS)
-        held = (state.t == state.nearest) & (state.name >= 0)
-        names = jnp.where(held, state.name, NO_NAME)
-        if self.has_faces:
-            faces = jnp.where(held, self.tile.among(held).faces_of(state.name), NO_NAME)
-            names = jnp.where(faces == _over_lanes(jnp.min, faces), names, NO_NAME)
-        least = _over_lanes(jnp.min, names)
-        return jnp.where(least == NO_NAME, MISS, least)
+def _at_leaves(state: _State) -> Array:
+    return state.census >> 16
 
 
 def _any(flags: Array) -> Array:
     """() bool: whether any is set."""
-    return jnp.max(jnp.where(flags, np.int32(1), np.int32(0)).reshape(-1)) > 0
+    return jnp.max(jnp.where(flags, np.int32(1), np.int32(0))) > 0
 
 
 # Notes
 #
-# NVIDIA H100, 2**20 rays in its memory, Mray/s of closest hits, camera / occlusion / random, Stanford dragon:
-# expanded 1253 / 562 / 839, compressed 711 / 297 / 462; the twin does 1 to 6. Plain CUDA, one ray a thread
-# through a rebuilt binary hierarchy, with a test that leaks (`bench_gpu_yardstick`), does 4142 / 1294 / 2859.
-# A step at nodes takes 115 instructions, one at expanded leaves 215, of four rays. Compiled by Triton 3.6, no
-# value moves through shared memory, nothing is spilled, and 64 registers let 32 warps be at work.
+# NVIDIA H100, rays in its memory, millions of closest hits a second, camera / occlusion / random rays, stored
+# hierarchy of the Stanford dragon, 2**20 rays a call. Before: a warp took four rays, eight lanes each, and
+# what a ray has one of stood in eight threads: 1253 / 562 / 839 expanded, 711 / 297 / 462 compressed, held up
+# by issuing. Now 2755 / 1238 / 1625 and 1589 / 784 / 1274; under the rebuilt hierarchy 2956 / 1304 / 1746.
+# Plain CUDA with a test that leaks (`bench_gpu_yardstick`): 4049 / 1752 / 2914, and where triangles are long
+# and thin (powerplant) 346 / 251 / 154 for 1685 / 1128 / 1014 here. All with other processes on the host, and
+# 16 rays replaced at a time: 8 give 2501 / 1047 / 1561, 24 give 2986 / 1272 / 1826 and are taken now. Entries
+# in registers: 4 and 16 give 2808 / 1243 / 1714 and 2811 / 1267 / 1769.
 #
-# Tried and lost (speed over what stands here): one ray a thread through a binary hierarchy made of the wide
-# one's lanes, a node in four reads of 16 bytes, the stack in memory: 0.98 / 0.80 / 0.83; eight rays a warp
-# 0.82 / 0.72 / 0.69; nodes read without a mask, by waiting rays too, 0.98 / 0.79 / 0.96; on to the leaves as
-# soon as more rays wait there than are at nodes 0.94 / 0.91 / 0.94, or twice as many 0.90 / 0.98 / 0.95; a
-# node, then a leaf, in turns 0.98 / 0.84 / 0.97.
+# Compiled by Triton 3.6 a step at nodes takes 249 instructions of 32 rays, a leaf 2 * 197, a triangle tested
+# exactly 180, coming in some 450; packed 381, 330 and 109 a triangle, 472. Nothing is spilled, 124 registers
+# let 16 warps be at work. Of the camera's rays every other issue slot is empty: warps wait for memory (42 %
+# of samples), where each sector that is read is read twice and hardly ever again.
 #
-# Not tried: addresses take three instructions a read, since Triton's offsets are 32 bits wide and may wrap; a
-# vote would do for a sum over lanes, but Triton has none, and assembly must not know which thread has a lane.
+# What gave how much, camera rays: a ray a thread 1253 to 1963, with rays taken by chunks of 128; by chunks of
+# 32, 2554; the rest as many as there is room for, sides fused, nodes read without masks, leaves sifted by
+# three minima. An atomic operation of one thread alone takes four bytes of shared memory, and the driver then
+# leaves the cache 23 KB.
+#
+# Next: packed nodes over expanded leaves, 64 bytes in the place of 224; warps of one multiprocessor near each
+# other in the picture; fewer registers.
