@@ -48,7 +48,7 @@ COSTS_BY_NAME = ("vertices per triangle", "relative expected cost", "seconds")
 
 COUNTS = (
     "rays verified", "aimed rays", "uncertain rays", "wrong faces", "steps", "open edges",
-    "Draco", "meshoptimizer", "vtkStripper", "pyffi", "plain CUDA",
+    "Draco", "meshoptimizer", "vtkStripper", "pyffi", "plain CUDA", "warp",
 )  # fmt: skip
 """What is in the names of figures that are neither better nor worse: of an input, or of a peer alone."""
 

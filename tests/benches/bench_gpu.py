@@ -1,25 +1,26 @@
 """Tracing on a GPU against the CPU path in the same process: the same hits, and rays a second.
 
     python tests/benches/bench_gpu.py MODEL [MODEL ...] [--rays 20] [--repeats 5]
-        [--resident expanded compressed] [--under slbvh ...] [--twin] [--record] [--note TEXT]
+        [--kinds expanded compressed rebuilt] [--under slbvh ...] [--twin] [--record] [--note TEXT]
 
 MODEL is a mesh or a scene file. Camera rays: 1024 x 1024 pixels in tiles of 8 x 8, the model framed; ambient
 occlusion: one cosine-distributed ray from each point seen; random rays: 2**rays chords of the bounding
 sphere. Every answer of the GPU is compared with the CPU's: a difference in face or in a bit of t counts.
 Rates are given of whole calls, transfers and weighing of hits included, and of the device alone: rays made
-ready and walked, rays and results in its memory. `--twin` measures there the kernel's plain-JAX twin
-too; hierarchies named by `--under` have no kernel and are walked by vmap. `--record` appends the figures to
-`results.csv`.
+ready and walked, rays and results in its memory, occlusion rays repeated until there are as many as random
+ones. `--kinds` are residencies, or `rebuilt`, expanded under a hierarchy that the tracer makes. `--twin`
+measures there the kernel's plain-JAX twin too; hierarchies named by `--under` have no kernel and are walked
+by vmap. `--record` appends the figures to `results.csv`.
 """
 
 import argparse
 import sys
 import time
 from pathlib import Path
-from typing import get_args
 
 import jax
 import numpy as np
+from jax.sharding import NamedSharding
 from results import Row, append
 
 import striptools
@@ -27,10 +28,8 @@ from striptools.hierarchies.options import HierarchyOptions
 from striptools.reducem.scene import Scene
 from striptools.trace import Tracer
 from striptools.trace.device import quiet_jax
-from striptools.trace.launch import program
-from striptools.trace.pallas.walk import RAYS
+from striptools.trace.launch import RAYS, program
 from striptools.trace.rays import Camera, camera_rays, cosine_rays
-from striptools.trace.tracer import ResidentKind
 
 BENCH = {
     "takes": "paths",
@@ -40,6 +39,13 @@ BENCH = {
     "needs": ["gpu"],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
+
+KINDS = {
+    "expanded": {"resident": "expanded"},
+    "compressed": {"resident": "compressed"},
+    "rebuilt": {"hierarchy": "rebuilt"},
+}
+"""How the tracer is asked for each."""
 
 PIXELS = 1024
 TILE = 8
@@ -53,7 +59,7 @@ def main() -> int:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--rays", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--resident", nargs="*", default=["expanded", "compressed"])
+    parser.add_argument("--kinds", nargs="*", choices=KINDS, default=list(KINDS))
     parser.add_argument("--under", nargs="*", default=[])
     parser.add_argument("--twin", action="store_true")
     parser.add_argument("--record", action="store_true")
@@ -66,7 +72,7 @@ def main() -> int:
     for path in arguments.models:
         scene = striptools.open(path) if path.suffix == ".rdm" else striptools.convert(path)
         cpu = Tracer(scene, device="cpu", resident="expanded")
-        for what in (*arguments.resident, *arguments.under):
+        for what in (*arguments.kinds, *arguments.under):
             rows = measure(path.stem, scene, what, cpu, arguments)
             for row in rows:
                 sys.stdout.write(f"{row.mesh}: {row.metric} {row.value:.6g} {row.unit} ({row.note})\n")
@@ -78,9 +84,9 @@ def main() -> int:
 
 
 def measure(name: str, scene: Scene, what: str, cpu: Tracer, arguments: argparse.Namespace) -> list[Row]:
-    """Trace every kind of ray on both devices; `what` is a residency or another hierarchy."""
-    if what in get_args(ResidentKind):
-        gpu = Tracer(scene, device="gpu", resident=what)  # pyright: ignore[reportArgumentType]
+    """Trace every kind of ray on both devices; `what` is one of `KINDS` or another hierarchy."""
+    if what in KINDS:
+        gpu = Tracer(scene, device="gpu", **KINDS[what])  # pyright: ignore[reportArgumentType]
     else:
         gpu = Tracer(scene.under(HierarchyOptions(what)), device="gpu")  # pyright: ignore[reportArgumentType]
     device = str(gpu.devices[0].device_kind)
@@ -99,22 +105,25 @@ def measure(name: str, scene: Scene, what: str, cpu: Tracer, arguments: argparse
         ]
         for twin in (False, True)[: 1 + arguments.twin]:
             for any_hit, asked in ((False, "closest hit"), (True, "any hit")):
-                value, by = device_rate(gpu, rays, arguments.repeats, any_hit=any_hit, twin=twin)
+                many = [np.resize(a, (2**arguments.rays, 3)) for a in rays]
+                value, by = device_rate(gpu, many, arguments.repeats, any_hit=any_hit, twin=twin)
                 metric = f"{kind} rays, {asked}, {by}, on the device alone"
                 rows.append(Row("gpu", name, count, metric, value, "Mray/s", note=note))
     return rows
 
 
-def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin: bool) -> tuple[float, str]:
+def device_rate(
+    tracer: Tracer, rays: list[np.ndarray], repeats: int, *, any_hit: bool, twin: bool
+) -> tuple[float, str]:
     """Millions of rays a second of many calls in a row, rays and results in the device's memory; by what."""
-    count = len(rays[0]) // RAYS * RAYS
     options = tracer._options(any_hit=any_hit)
     assert options is not None
     if twin:
         options = options._replace(kernel=False)
     run = program(tracer._mesh, options)
-    reach = np.full(count, np.inf, np.float32)
-    given = jax.device_put((rays[0][:count], rays[1][:count], reach), tracer.devices[0])
+    count = len(rays[0])
+    # Placed as the tracer places them: the program is the one that it has compiled.
+    given = jax.device_put([*rays, np.full(count, np.inf, np.float32)], NamedSharding(tracer._mesh, RAYS))
     calls, best = 20 if options.kernel else 1, np.inf
     with quiet_jax():
         for _ in range(repeats + 1):

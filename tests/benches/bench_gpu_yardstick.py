@@ -1,4 +1,4 @@
-"""A plain CUDA tracer on the rays of `bench_gpu`, as a measure of what the card can do.
+"""A plain CUDA tracer on the rays of `bench_gpu`, and NVIDIA Warp: a measure of what the card can do.
 
     python tests/benches/bench_gpu_yardstick.py MODEL [MODEL ...] [--rays 20] [--repeats 20] [--record]
 
@@ -7,11 +7,22 @@ children's boxes in a node of 64 bytes, nearest child first, the stack in local 
 "Understanding the Efficiency of Ray Traversal on GPUs" (HPG 2009), without persistent threads.
 Moeller-Trumbore's test: it leaks, and its division is an approximation, so that hits are counted and not
 compared bit for bit. Needs CuPy.
+
+Warp (`warp-lang`) is measured too where it is installed: its queries of a mesh, one ray a thread, by its own
+hierarchy and its own triangle test. Where the hierarchy can be chosen (1.6) it is the one by SAH; before, an
+LBVH with a triangle a leaf. A query for any hit is there from 1.11 on: with older ones, only closest hits are
+measured.
 """
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import cupy
 import jax
@@ -32,11 +43,16 @@ BENCH = {
     "full": [[]],
     "quick": [["--rays", "16", "--repeats", "2"]],
     "needs": ["gpu", "cupy"],
+    "peers": ["warp"],
 }
 """How `striptools bench` calls this: see `measure.bench_scripts`."""
 
 LEAF = 4
 THREADS = 128
+
+Rays = tuple[np.ndarray, np.ndarray]
+Query = tuple[str, Callable[[], object], Callable[[], np.ndarray]]
+"""What is asked, a call that starts the kernel, and one that gives the faces hit, -1 for none."""
 
 SOURCE = r"""
 __device__ __forceinline__ float3 operator-(float3 a, float3 b)
@@ -122,6 +138,121 @@ extern "C" __global__ void trace(const float4 *nodes, const float4 *corners, con
 """
 
 
+class PlainCuda:
+    """The kernel here, started by CuPy."""
+
+    name = "plain CUDA"
+
+    def __init__(self, scene: Scene) -> None:
+        self.kernel = cupy.RawKernel(SOURCE, "trace", options=("--use_fast_math",))
+        self.arrays = [cupy.asarray(a) for a in binary_layout(scene)]
+
+    def queries(self, rays: Rays) -> Iterator[Query]:
+        """Closest and any hits of rays that are in the device's memory."""
+        count = len(rays[0])
+        on_device = [cupy.asarray(a) for a in rays]
+        t, face = cupy.zeros(count, cupy.float32), cupy.zeros(count, cupy.int32)
+        for any_hit, what in ((0, "closest hit"), (1, "any hit")):
+            given = (*self.arrays, *on_device, np.int32(count), np.int32(any_hit), t, face)
+            yield what, lambda given=given: self.kernel((-(-count // THREADS),), (THREADS,), given), face.get
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        """Of one call, by the device's own clock."""
+        start, end = cupy.cuda.Event(), cupy.cuda.Event()
+        start.record()
+        call()
+        end.record()
+        end.synchronize()
+        return cupy.cuda.get_elapsed_time(start, end) / 1e3
+
+
+class Warp:
+    """The peer: the queries of a mesh that NVIDIA Warp has, on a device that it knows by a name.
+
+    Directions need not be of length 1: t is in units of them. Some versions widen boxes by 1e-3, whatever the
+    model's size: scene and rays are scaled by a power of two, so that the longest side is 512 to 1024. That
+    changes no bit of t.
+    """
+
+    def __init__(self, scene: Scene, device: str = "cuda") -> None:
+        self.wp: Any = import_module("warp")
+        wp, self.device = self.wp, device
+        if hasattr(wp.config, "quiet"):
+            wp.config.quiet = True
+        else:
+            wp.config.log_level = wp.LOG_WARNING
+        self.name = f"warp {wp.config.version}"
+        size = np.ptp(scene.positions, axis=0).max()
+        self.scale = np.float32(2.0 ** (10 - np.frexp(size)[1]))
+        positions = wp.array(self.scale * scene.positions, dtype=wp.vec3, device=device)
+        faces = wp.array(scene.faces().astype(np.int32).ravel(), dtype=wp.int32, device=device)
+        can_choose = "bvh_constructor" in signature(wp.Mesh.__init__).parameters
+        chosen = {"bvh_constructor": "sah"} if can_choose else {}
+        self.mesh = wp.Mesh(positions, faces, **chosen)
+
+    def queries(self, rays: Rays) -> Iterator[Query]:
+        """Closest hits, and any where there is a query for it, of rays that are in the device's memory."""
+        wp, count = self.wp, len(rays[0])
+        on_device = [wp.array(self.scale * a, dtype=wp.vec3, device=self.device) for a in rays]
+        t = wp.zeros(count, dtype=wp.float32, device=self.device)
+        face = wp.zeros(count, dtype=wp.int32, device=self.device)
+        for what, kernel in warp_kernels().items():
+            given = [self.mesh.id, *on_device, t, face]
+            launch = wp.launch(kernel, dim=count, inputs=given, device=self.device, record_cmd=True)
+            yield what, launch.launch, face.numpy
+
+    def seconds(self, call: Callable[[], object]) -> float:
+        """Of one call, by the device's own clock."""
+        stream = self.wp.get_stream(self.device)
+        start, end = (self.wp.Event(self.device, enable_timing=True) for _ in range(2))
+        stream.record_event(start)
+        call()
+        stream.record_event(end)
+        return self.wp.get_event_elapsed_time(start, end) / 1e3
+
+
+@cache
+def warp_kernels() -> dict[str, Any]:
+    """Warp's kernel of each query that it has; all take the same arguments."""
+    wp: Any = import_module("warp")
+
+    @wp.kernel(enable_backward=False)
+    def closest_hit(
+        mesh: wp.uint64,
+        origins: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        t: wp.array(dtype=wp.float32),
+        face: wp.array(dtype=wp.int32),
+    ):
+        ray = wp.tid()
+        query = wp.mesh_query_ray(mesh, origins[ray], directions[ray], wp.inf)
+        if query.result:
+            t[ray] = query.t
+            face[ray] = query.face
+        else:
+            t[ray] = wp.inf
+            face[ray] = -1
+
+    if tuple(int(part) for part in wp.config.version.split(".")[:2]) < (1, 11):
+        return {"closest hit": closest_hit}
+
+    @wp.kernel(enable_backward=False)
+    def any_hit(
+        mesh: wp.uint64,
+        origins: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        t: wp.array(dtype=wp.float32),
+        face: wp.array(dtype=wp.int32),
+    ):
+        ray = wp.tid()
+        if wp.mesh_query_ray_anyhit(mesh, origins[ray], directions[ray], wp.inf):
+            face[ray] = 0
+        else:
+            face[ray] = -1
+
+    return {"closest hit": closest_hit, "any hit": any_hit}
+
+
 def main() -> int:
     """Measure each model; 2 where there is no GPU."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -146,52 +277,38 @@ def main() -> int:
 
 def measure(name: str, scene: Scene, arguments: argparse.Namespace) -> list[Row]:
     """Trace every kind of ray, rays and results on the device."""
-    kernel = cupy.RawKernel(SOURCE, "trace", options=("--use_fast_math",))
-    arrays = [cupy.asarray(a) for a in binary_layout(scene)]
+    tracers = [PlainCuda(scene), *([] if find_spec("warp") is None else [Warp(scene)])]
     cpu = Tracer(scene, device="cpu", resident="expanded")
     device = cupy.cuda.runtime.getDeviceProperties(0)["name"].decode()
     rows = []
-    for kind, rays in ray_kinds(scene, cpu, 2**arguments.rays):
-        count = len(rays[0])
-        on_device = [cupy.asarray(a) for a in rays]
-        t, face = cupy.zeros(count, cupy.float32), cupy.zeros(count, cupy.int32)
-        wanted = cpu.closest_hit(*rays)
-        for any_hit, what in ((0, "closest hit"), (1, "any hit")):
-            given = (*arrays, *on_device, np.int32(count), np.int32(any_hit), t, face)
-            seconds = median_seconds(
-                lambda given=given, count=count: kernel((-(-count // THREADS),), (THREADS,), given),
-                arguments.repeats,
-            )
-            found = cupy.asnumpy(face) >= 0
-            otherwise = int((found != wanted.hit).sum())
-            note = f"{device}, {count} rays on the device, {otherwise} hit or miss otherwise"
-            metric = f"{kind} rays, {what}, plain CUDA"
-            rows.append(
-                Row(
-                    "gpu_yardstick",
-                    name,
-                    scene.triangle_count,
-                    metric,
-                    count / seconds / 1e6,
-                    "Mray/s",
-                    note=note,
+    count = 2**arguments.rays
+    for kind, (origins, directions) in ray_kinds(scene, cpu, count):
+        # As in `bench_gpu`, occlusion rays are repeated.
+        many = np.resize(origins, (count, 3)), np.resize(directions, (count, 3))
+        wanted = np.resize(cpu.closest_hit(origins, directions).hit, count)
+        for tracer in tracers:
+            for what, call, faces in tracer.queries(many):
+                seconds = median_seconds(tracer, call, arguments.repeats)
+                otherwise = int(((faces() >= 0) != wanted).sum())
+                note = f"{device}, {count} rays on the device, {otherwise} hit or miss otherwise"
+                metric = f"{kind} rays, {what}, {tracer.name}"
+                rows.append(
+                    Row(
+                        "gpu_yardstick",
+                        name,
+                        scene.triangle_count,
+                        metric,
+                        count / seconds / 1e6,
+                        "Mray/s",
+                        note=note,
+                    )
                 )
-            )
     return rows
 
 
-def median_seconds(call: object, repeats: int) -> float:
-    """By the device's own clock, after two calls that do not count."""
-    seconds = []
-    for k in range(repeats + 2):
-        start, end = cupy.cuda.Event(), cupy.cuda.Event()
-        start.record()
-        call()  # pyright: ignore[reportCallIssue]
-        end.record()
-        end.synchronize()
-        if k >= 2:
-            seconds.append(cupy.cuda.get_elapsed_time(start, end) / 1e3)
-    return float(np.median(seconds))
+def median_seconds(tracer: PlainCuda | Warp, call: Callable[[], object], repeats: int) -> float:
+    """Of a call, after two that do not count."""
+    return float(np.median([tracer.seconds(call) for _ in range(repeats + 2)][2:]))
 
 
 def binary_layout(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
