@@ -161,6 +161,10 @@ class WideScene(NamedTuple):
 # since save 5 % of the nodes of occlusion rays, 13 % of a camera's one by one; children sorted by distance
 # 10 % and 20 %, and any hit then visits 4 % more.
 #
+# Any hit that visits what is far first: occlusion rays of scans meet 3 to 5 % fewer nodes and 7 to 10 % fewer
+# leaves (bunny, dragon), chords as many, and are traced 0.94 to 1.02 times as fast: what is near lies in the
+# cache. The longest way through a box first would save 3 % more of both.
+#
 # Sifting leaves before hits are weighed (`walk.sifted`; rebuilt; bunny, dragon): occlusion closest 1.18,
 # 1.13, any hit 1.05, 1.02, a camera's rays one by one 1.0, 1.02. With the division left to the cond, but its
 # two numbers kept for it, 1.10; with edge functions alone 0.95; with the straddling of corners too 1.02. The
