@@ -39,10 +39,11 @@ from jax import Array, custom_batching, lax
 from striptools.errors import UsageError
 from striptools.trace.containment import WAY
 from striptools.trace.gathering import MOST_HITS
+from striptools.trace.launch import tracing
 from striptools.trace.numerics import power_of_two_below
 from striptools.trace.tracer import Tracer
 from striptools.trace.triangle import Corners, edges_of, pick, shear_of
-from striptools.trace.walk import MISS, STUCK, Traced, WalkOptions, WalkScene, trace_rays
+from striptools.trace.walk import MISS, STUCK, Traced, WalkOptions, WalkScene
 from striptools.trace.walk_instances import InstancedScene, trace_in_place
 
 
@@ -182,12 +183,9 @@ def _walked(walker: _Walker, origins: Array, directions: Array, reach: Array) ->
 def _traced(scene: Any, origins: Array, directions: Array, reach: Array, options: WalkOptions) -> Traced:
     if isinstance(scene, InstancedScene):
         return trace_in_place(scene, origins, directions, reach, options)
-    if options.kernel and options.gather is None:
-        # Here, so that a JAX without Pallas or its Triton does for all else.
-        from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
-
-        return trace_by_kernel(scene, origins, directions, reach, options)
-    return trace_rays(scene, origins, directions, reach, options)
+    # The kernel gathers nothing.
+    options = options._replace(kernel=options.kernel and options.gather is None)
+    return tracing(options)(scene, origins, directions, reach, options)
 
 
 # Outside of a program of the user's, one that is compiled once.

@@ -66,12 +66,19 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
 
 def _walk_of(options: WalkOptions, packets: bool) -> tuple[Any, int]:
     """What walks rays, and how many arrays they are."""
+    if options.kernel or options.batch:
+        return tracing(options), 3
+    return _walk_packets if packets else _walk_ready, 1
+
+
+def tracing(options: WalkOptions) -> Callable[..., Traced]:
+    """What traces rays that are not ready yet: the kernel, or its twin."""
     if options.kernel:
         # Here, so that a JAX without Pallas or its Triton does for all else.
         from striptools.trace.pallas.walk import trace_rays as trace_by_kernel
 
-        return trace_by_kernel, 3
-    return (trace_rays, 3) if options.batch else (_walk_packets if packets else _walk_ready, 1)
+        return trace_by_kernel
+    return trace_rays
 
 
 def _walk_ready(scene: WalkScene, ready: jax.Array, options: WalkOptions) -> Traced:

@@ -25,7 +25,6 @@ Differences:
 Corners come in the canonical order of `kernels.wide.fill_leaf_blocks`.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -37,7 +36,6 @@ from striptools.trace.numerics import (
     BY_XLA,
     Arithmetic,
     larger,
-    quotient,
     rounded,
     sign_of,
     smaller,
@@ -85,9 +83,7 @@ class Edges(NamedTuple):
     y: Corners
 
 
-def shear_of(
-    origin: Coordinates, direction: Coordinates, divided: Callable[[Array, Array], Array] = quotient
-) -> Shear:
+def shear_of(origin: Coordinates, direction: Coordinates, arithmetic: Arithmetic = BY_XLA) -> Shear:
     """Shear constants of a ray, or of many at once; `direction` must not be zero."""
     size = [abs(way) for way in direction]
     z = jnp.where((size[0] >= size[1]) & (size[0] >= size[2]), 0, jnp.where(size[1] >= size[2], 1, 2))
@@ -99,9 +95,9 @@ def shear_of(
     return Shear(
         axes,
         (pick(origin, x), pick(origin, y), pick(origin, z)),
-        divided(pick(direction, x), depth),
-        divided(pick(direction, y), depth),
-        divided(jnp.ones_like(depth), depth),
+        arithmetic.quotient(pick(direction, x), depth),
+        arithmetic.quotient(pick(direction, y), depth),
+        arithmetic.quotient(jnp.ones_like(depth), depth),
     )
 
 

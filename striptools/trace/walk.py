@@ -45,7 +45,6 @@ from striptools.trace.numerics import (
     index,
     larger,
     power_of_two_below,
-    quotient,
     smaller,
 )
 from striptools.trace.triangle import Corners, Shear, edges_of, may_cross, pick, shear_of
@@ -103,9 +102,6 @@ class Best(NamedTuple):
     nearest: Array
     name: Array
 
-
-Divided = Callable[[Array, Array], Array]
-"""A quotient of two."""
 
 Found = Best | Gathered
 """What a ray has found so far: both have a `nearest`, beyond which nothing matters."""
@@ -459,7 +455,11 @@ def _prepare(scene: WalkScene, origin: Array, direction: Array, t_max: Array) ->
 
 
 def ready_words(
-    frame: Frame, origin: Coordinates, direction: Coordinates, t_max: Array, divided: Divided = quotient
+    frame: Frame,
+    origin: Coordinates,
+    direction: Coordinates,
+    t_max: Array,
+    arithmetic: Arithmetic = BY_XLA,
 ) -> tuple[list[Array], list[Array]]:
     """The 17 floats of a `ReadyRay`, or of many at once, and its first five integers.
 
@@ -470,7 +470,7 @@ def ready_words(
         origin: Three float32.
         direction: Three float32.
         t_max: Float32.
-        divided: A quotient, rounded correctly by the compiler at hand.
+        arithmetic: Of the compiler at hand.
     """
     longest = largest_of(direction)
     shorten, length = power_of_two_below(longest)
@@ -480,9 +480,9 @@ def ready_words(
     for bit, way in zip((1, 2, 4), direction, strict=True):
         octant = octant ^ jnp.where(way < 0, jnp.int32(bit), jnp.int32(0))
     slab = slab_of(origin, direction, frame)
-    shear = shear_of(origin, direction, divided)
+    shear = shear_of(origin, direction, arithmetic)
     limit = t_max * length * frame.scale
-    unit = divided(shorten, jnp.broadcast_to(frame.scale, shorten.shape))
+    unit = arithmetic.quotient(shorten, jnp.broadcast_to(frame.scale, shorten.shape))
     floats = [*slab.low, *slab.high, *slab.inverse, *shear.origin, shear.x, shear.y, shear.z, limit, unit]
     axes = (axis.astype(jnp.int32) for axis in shear.axes)
     return floats, [*axes, octant, jnp.where(valid, DONE, jnp.int32(0))]

@@ -193,7 +193,7 @@ class PackedScene(NamedTuple):
         assert decode is not None
         # Behind a barrier, or XLA reads it anew for every use of it.
         header = self._settled(self._row(self.headers, where.block, 0, 8))
-        x, y, z = self._decoded(header, where, axes_of(header, self.scale_exponent), decode)
+        x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
         ax, ay, az = (_along(x, y, z, axis) for axis in axes)
         return Leaf(ax, ay, az, first_corner(x, y, z), *self._named(where))
 
@@ -209,9 +209,7 @@ class PackedScene(NamedTuple):
 
         def decoded() -> tuple[list[Array], ...]:
             header = self._settled(self._once(self.headers, where.block))
-            described = axes_of(header, self.scale_exponent)
-            chosen = [Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
-            x, y, z = self._decoded(header, where, chosen, decode)
+            x, y, z = self._decoded(header, where, axes_along(header, self.scale_exponent, axes), decode)
             return x, y, z
 
         # Always so, which XLA does not know.
@@ -225,7 +223,7 @@ class PackedScene(NamedTuple):
         name = (where.block << 8 | ((where.said & 0xFF) + lane)).astype(jnp.int32)
         return lane <= (where.said >> 8 & 7), name
 
-    def _decoded(self, header: Any, where: "_Run", axes: list["Axis"], decode: Decode) -> list[list[Array]]:
+    def _decoded(self, header: Any, where: "_Run", axes: list["_Axis"], decode: Decode) -> list[list[Array]]:
         """Coordinates along axes of the corners a, b, c of a run's triangles, scaled."""
         corners = self._corners(header, where.said, decode.flips)
         return self._positions(header, corners, axes, decode)
@@ -372,7 +370,7 @@ class PackedScene(NamedTuple):
         return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
-        self, header: Any, corners: tuple[Array, ...], axes: list["Axis"], decode: Decode
+        self, header: Any, corners: tuple[Array, ...], axes: list["_Axis"], decode: Decode
     ) -> list[list[Array]]:
         """Scaled coordinates of the corners along axes, (8,) float32 each."""
         counts = header[2]
@@ -401,7 +399,7 @@ class _Run(NamedTuple):
     said: Array
 
 
-class Axis(NamedTuple):
+class _Axis(NamedTuple):
     """How a block's coordinates on an axis are written: () each."""
 
     offset: Any
@@ -423,7 +421,13 @@ def index_stream(header: Any) -> tuple[Array, Array]:
     return (2 + (counts >> 24 & 1)) * ((counts & 0xFF) + 1), 32 - _leading_zeros(counts >> 8 & 0xFF)
 
 
-def axes_of(header: Any, scale_exponent: Array) -> list[Axis]:
+def axes_along(header: Any, scale_exponent: Array, axes: tuple[Array, Array, Array]) -> list[_Axis]:
+    """The axes of a block in another order, as of a shear."""
+    described = _axes(header, scale_exponent)
+    return [_Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
+
+
+def _axes(header: Any, scale_exponent: Array) -> list[_Axis]:
     """The three axes of a block; the exponent is that of the scaled coordinates."""
     described = header[6], header[6] >> 8, header[6] >> 16
     exponents = header[6] >> 24, header[7] & 0xFF, header[7] >> 8 & 0xFF
@@ -432,12 +436,12 @@ def axes_of(header: Any, scale_exponent: Array) -> list[Axis]:
     for axis in range(3):
         width, mode = described[axis] & 63, described[axis] >> 6 & 3
         exponent = exponents[axis].astype(jnp.int32) - 149 + scale_exponent
-        axes.append(Axis(offset, width, mode, header[3 + axis], exponent, scale_exponent))
+        axes.append(_Axis(offset, width, mode, header[3 + axis], exponent, scale_exponent))
         offset = offset + width
     return axes
 
 
-def _coordinate(vertex: list[Array], axis: Axis, decode: Decode) -> Array:
+def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
     """One scaled coordinate of (8,) vertices, from the words that they begin."""
     place, shift = axis.offset >> 5, axis.offset & 31
     padded = [*vertex, jnp.zeros_like(vertex[0])]

@@ -103,18 +103,22 @@ def measure(name: str, scene: Scene, what: str, cpu: Tracer, arguments: argparse
             rate(name, count, f"{kind} rays, closest hit", gpu.closest_hit, rays, arguments.repeats, note),
             rate(name, count, f"{kind} rays, any hit", gpu.any_hit, rays, arguments.repeats, note),
         ]
+        many = repeated(rays, 2**arguments.rays)
         for twin in (False, True)[: 1 + arguments.twin]:
             for any_hit, asked in ((False, "closest hit"), (True, "any hit")):
-                many = [np.resize(a, (2**arguments.rays, 3)) for a in rays]
                 value, by = device_rate(gpu, many, arguments.repeats, any_hit=any_hit, twin=twin)
                 metric = f"{kind} rays, {asked}, {by}, on the device alone"
                 rows.append(Row("gpu", name, count, metric, value, "Mray/s", note=note))
     return rows
 
 
-def device_rate(
-    tracer: Tracer, rays: list[np.ndarray], repeats: int, *, any_hit: bool, twin: bool
-) -> tuple[float, str]:
+def repeated(rays: Rays, count: int) -> Rays:
+    """So many of them: where there are fewer, from the first on again."""
+    origins, directions = (np.resize(a, (count, 3)) for a in rays)
+    return origins, directions
+
+
+def device_rate(tracer: Tracer, rays: Rays, repeats: int, *, any_hit: bool, twin: bool) -> tuple[float, str]:
     """Millions of rays a second of many calls in a row, rays and results in the device's memory; by what."""
     options = tracer._options(any_hit=any_hit)
     assert options is not None

@@ -27,7 +27,7 @@ from typing import Any
 import cupy
 import jax
 import numpy as np
-from bench_gpu import ray_kinds
+from bench_gpu import Rays, ray_kinds, repeated
 from results import Row, append
 
 import striptools
@@ -50,7 +50,6 @@ BENCH = {
 LEAF = 4
 THREADS = 128
 
-Rays = tuple[np.ndarray, np.ndarray]
 Query = tuple[str, Callable[[], object], Callable[[], np.ndarray]]
 """What is asked, a call that starts the kernel, and one that gives the faces hit, -1 for none."""
 
@@ -282,10 +281,10 @@ def measure(name: str, scene: Scene, arguments: argparse.Namespace) -> list[Row]
     device = cupy.cuda.runtime.getDeviceProperties(0)["name"].decode()
     rows = []
     count = 2**arguments.rays
-    for kind, (origins, directions) in ray_kinds(scene, cpu, count):
+    for kind, rays in ray_kinds(scene, cpu, count):
         # As in `bench_gpu`, occlusion rays are repeated.
-        many = np.resize(origins, (count, 3)), np.resize(directions, (count, 3))
-        wanted = np.resize(cpu.closest_hit(origins, directions).hit, count)
+        many = repeated(rays, count)
+        wanted = np.resize(cpu.closest_hit(*rays).hit, count)
         for tracer in tracers:
             for what, call, faces in tracer.queries(many):
                 seconds = median_seconds(tracer, call, arguments.repeats)

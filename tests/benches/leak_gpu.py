@@ -13,7 +13,7 @@ from striptools.trace.layout import Rays
 from striptools.trace.pallas import walk as kernel
 from striptools.trace.streams import Take
 from striptools.trace.tracer import ResidentKind
-from striptools.trace.walk import Traced, WalkOptions, WalkScene, trace_rays
+from striptools.trace.walk import WalkOptions, trace_rays
 
 RAYS_AT_ONCE = (2**8, 2**12)
 
@@ -50,10 +50,5 @@ class GpuWalk(Tracer):
 def _program(by_kernel: bool, options: WalkOptions) -> Any:
     """The jitted function from a scene and rays to `Traced`."""
     unfused = UNFUSED if by_kernel and options.decode is not None else {}
-    walk = partial(_walked, by_kernel=by_kernel, options=options)
-    return jax.jit(walk, compiler_options={**QUICK, **unfused})
-
-
-def _walked(scene: WalkScene, *rays: Any, by_kernel: bool, options: WalkOptions) -> Traced:
     trace = partial(kernel.trace_rays, interpret=True) if by_kernel else trace_rays
-    return trace(scene, *rays, options)
+    return jax.jit(partial(trace, options=options), compiler_options={**QUICK, **unfused})

@@ -16,12 +16,11 @@ from jax.experimental.pallas import triton as plgpu
 
 from striptools.trace.box import FAR_FACTOR
 from striptools.trace.pallas.arithmetic import KernelArithmetic
-from striptools.trace.triangle import Shear, edge_functions, pick, sheared
+from striptools.trace.triangle import Shear, edge_functions, sheared
 from striptools.trace.walk import WIDTH, Decode, Frame, Leaf, WalkScene
 from striptools.trace.walk_packed import (
-    Axis,
     PackedScene,
-    axes_of,
+    axes_along,
     first_place,
     index_stream,
     power_of_two,
@@ -129,9 +128,9 @@ def frame_at(words: Any) -> Frame:
     return Frame(scale, reach, tuple(rest[0:3]), tuple(rest[3:6]), rest[6])
 
 
-def lane_numbers() -> Array:
-    """(rays, 4) int32: the number of each lane in its half."""
-    return lax.broadcasted_iota(np.int32, (RAYS, HALF), 1)
+def lane_numbers(half: Any = 0) -> Array:
+    """(rays, 4) int32: the numbers of the lanes of a half."""
+    return lax.broadcasted_iota(np.int32, (RAYS, HALF), 1) + HALF * half
 
 
 def bits_in(flags: Array, bits: Array) -> Array:
@@ -191,8 +190,7 @@ class WideTile(NamedTuple):
                     (near, sides.near_rows[axis], sides.near[axis]),
                     (far, sides.far_rows[axis], sides.far[axis]),
                 ):
-                    lanes = lane_numbers() + np.int32(HALF * half)
-                    side = plgpu.load(self.nodes.at[each(node), each(row), lanes])
+                    side = plgpu.load(self.nodes.at[each(node), each(row), lane_numbers(half)])
                     found.append(self.arithmetic.fused(side, each(sides.inverse[axis]), each(at)))
             met.append(passes(near, far, each(limit), self.arithmetic))
         return met
@@ -210,7 +208,7 @@ class WideTile(NamedTuple):
         seen = jax.tree.map(each, shear)
 
         def sift(half: Any, crossed: Array) -> Array:
-            lanes = lane_numbers() + HALF * half
+            lanes = lane_numbers(half)
 
             def corner(axis: Array, k: int) -> Array:
                 row = each(axis.astype(np.int32) * 3 + k)
@@ -309,8 +307,7 @@ class PackedTile(PackedScene):
         """Along the strip: a triangle has two corners of the one before it, and one vertex more."""
         assert decode is not None
         header = self._row(self.headers, where.block, 0, 8)
-        described = axes_of(header, self.scale_exponent)
-        axes = [Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in shear.axes]
+        axes = axes_along(header, self.scale_exponent, shear.axes)
         said = where.said
         length, turns = (said >> 8 & 7).astype(np.int32), said >> 19
         indices, width = index_stream(header)

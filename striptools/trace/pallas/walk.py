@@ -29,7 +29,6 @@ from jax.experimental.pallas import triton as plgpu
 from striptools.trace.numerics import in_range
 from striptools.trace.pallas.arithmetic import BY_INTERPRETER, BY_TRITON, KernelArithmetic
 from striptools.trace.pallas.tiles import (
-    HALF,
     RAYS,
     Sides,
     Source,
@@ -309,8 +308,7 @@ class _Walk:
             for ref in (self.memory.origins, self.memory.directions)
         )
         t_max = plgpu.load(self.memory.t_max.at[row], mask=mask)
-        divided = self.arithmetic.exact.quotient
-        floats, ints = ready_words(self.memory.frame, origin, direction, t_max, divided)
+        floats, ints = ready_words(self.memory.frame, origin, direction, t_max, self.arithmetic.exact)
         low, high, inverse = floats[0:3], floats[3:6], floats[6:9]
         up = [(ints[3] >> axis & 1) != 0 for axis in range(3)]
         sides = Sides(
@@ -334,8 +332,8 @@ class _Walk:
 
     def counted(self, state: _State) -> _State:
         """The same, the census taken."""
-        at_leaf = (state.child < 0) & (state.child != DONE)
-        share = jnp.where(state.child >= 0, np.int32(1), jnp.where(at_leaf, np.int32(1 << 16), np.int32(0)))
+        at_leaf = jnp.where(_is_at_leaf(state), np.int32(1 << 16), np.int32(0))
+        share = jnp.where(state.child >= 0, np.int32(1), at_leaf)
         return state._replace(census=jnp.sum(share))
 
     # Nodes.
@@ -347,8 +345,7 @@ class _Walk:
         node = lax.max(state.child, np.int32(0))
         met = jnp.zeros_like(node)
         for half, there in enumerate(self.tile.lanes_met(node, state.ray.sides, state.nearest * SLACK)):
-            lanes = lane_numbers() + np.int32(HALF * half)
-            met = met | bits_in(there, np.int32(1) << (lanes ^ each(state.ray.mirror)))
+            met = met | bits_in(there, np.int32(1) << (lane_numbers(half) ^ each(state.ray.mirror)))
         # A walk in a circle ends: a ray visits each node once.
         visits = jnp.where(at_node, state.visits + 1, state.visits)
         met = jnp.where(at_node & (visits <= self.node_count), met, 0)
@@ -363,9 +360,10 @@ class _Walk:
 
     def next_child(self, state: _State, active: Array) -> _State:
         """Take the nearest lane left, of the node at hand or of the one on top of the stack."""
-        state, top = self.popped(state, active & (state.lanes == 0))
-        node = jnp.where(active & (state.lanes == 0), top >> WIDTH, state.node)
-        lanes = jnp.where(active & (state.lanes == 0), top & 255, state.lanes)
+        pop = active & (state.lanes == 0)
+        state, top = self.popped(state, pop)
+        node = jnp.where(pop, top >> WIDTH, state.node)
+        lanes = jnp.where(pop, top & 255, state.lanes)
         some = active & (lanes != 0)
         order = (31 - lax.clz(lanes)) & 7
         found = self.tile.among(some).child_of(node, order ^ state.ray.mirror)
@@ -419,7 +417,7 @@ class _Walk:
 
     def visit_leaves(self, state: _State) -> _State:
         """Each ray that is at a leaf tests its triangles and goes on."""
-        at_leaf = (state.child < 0) & (state.child != DONE)
+        at_leaf = _is_at_leaf(state)
         tile = self.tile.among(at_leaf)
         where = tile.find_leaf(jnp.where(at_leaf, state.child, -1))
         crossed = tile.lanes_crossed(state.ray.shear, where, self.options.decode)
@@ -459,6 +457,10 @@ class _Walk:
             return tied & (tile.faces_of(name) < tile.faces_of(other))
 
         return lax.cond(_any(tied), by_face, lambda: tied)
+
+
+def _is_at_leaf(state: _State) -> Array:
+    return (state.child < 0) & (state.child != DONE)
 
 
 def _at_nodes(state: _State) -> Array:
