@@ -12,6 +12,7 @@ from test_instances import SCENES, load
 from striptools.hierarchies.kdtree import build_kdtree
 from striptools.hierarchies.options import HierarchyOptions
 from striptools.hierarchies.slbvh import build_slbvh
+from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.rays import ROW
 from striptools.partition.boxes import range_boxes
 from striptools.pipeline import convert
@@ -105,6 +106,38 @@ def test_a_loop_that_is_not_hoisted_would_be_seen():
     text = jax.jit(scatters).lower(np.arange(8)).compile().as_text()
     assert text is not None
     assert loops_outside_hoisted_calls(text)
+
+
+def copied_in_loops(text, shape):
+    """Copies of an array of this shape that a compiled program makes in loops, not before the first of them."""
+    copies = re.findall(rf"= {re.escape(shape)}\S* copy\([^\n]*", text)
+    return [line for line in copies if "/while" in line]
+
+
+@pytest.mark.parametrize("packets", [False, True])
+@pytest.mark.parametrize("any_hit", [False, True])
+@pytest.mark.parametrize("resident", ["expanded", "compressed"])
+def test_stacks_are_not_copied_at_each_step(resident, any_hit, packets):
+    """What is read of a stack leads to what is written next, or XLA writes to a copy of it."""
+    tracer = Tracer(scene_under("reducem"), device="cpu", threads=1, resident=resident)
+    rays = np.zeros((128, PACKET_ROW) if packets else (256, ROW), np.float32)
+    lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), packets).lower(tracer._scene, rays)
+    assert copied_in_loops(lowered.compile().as_text(), f"s32[{tracer._stack_size},2]") == []
+
+
+def test_a_stack_that_is_copied_would_be_seen():
+    def walk(stack):
+        def step(carried):
+            height, seen, stack = carried
+            entry = jax.numpy.stack([height, seen])[None]
+            written = jax.lax.dynamic_update_slice(stack, entry, (height % 16, 0))
+            below = jax.lax.dynamic_slice(stack, (seen % 16, 0), (1, 2))[0, 0]
+            return height + 1, below + written.sum(), written
+
+        return jax.lax.while_loop(lambda carried: carried[0] < 99, step, (0, 1, stack))[2]
+
+    text = jax.jit(walk).lower(np.zeros((16, 2), np.int32)).compile().as_text()
+    assert copied_in_loops(text, "s32[16,2]")
 
 
 def test_options_tell_programs_apart():

@@ -420,29 +420,45 @@ def test_rays_are_made_ready_alike_here_and_on_a_device(ball, unit, lay):
 
 @pytest.mark.parametrize("lay", [lay_out, lay_out_packed])
 def test_a_ray_that_is_done_stays_so(ball, lay):
-    """Beside one that is not it visits the last node again and again, even where that has children."""
-    arrays = lay(ball).arrays
-    names = [name for name in ("nodes", "planes") if hasattr(arrays, name)]
-    scene = arrays._replace(
-        **{n: np.concatenate([getattr(arrays, n), getattr(arrays, n)[:1]]) for n in names}
-    )
+    """Beside one that is not it goes through the motions: of a packed scene with a last node with children."""
+    scene = lay(ball).arrays
+    if hasattr(scene, "planes"):
+        scene = scene._replace(**{n: with_last(getattr(scene, n)) for n in ("nodes", "planes")})
     origins, directions = rays_at(ball, 64, 3)
     ready = np.asarray(jax.jit(prepared_rays)(scene, origins, directions, np.full(64, np.inf, "f4")))
     options = WalkOptions(interleave=1, any_hit=False, counting=False, stack_size=32)
 
     @jax.jit
     def visited(scene, row):
-        ray, stack = walk.ReadyRay(row), walk._floor(scene, options)
-        steps = walk._Walk(scene, (ray,), options)
-        state = walk._State((walk._at_bottom(scene),), (stack,), np.int32(0), ())
-        at_root = state._replace(places=(ray.start._replace(child=np.int32(0)),))
+        steps, found = walk._Walk(scene, row, options), (walk.nothing_yet(walk.ReadyRay(row)),)
+        done, at_root = (walk.Place(np.int32(child), np.int32(0)) for child in (DONE, 0))
+        state = walk._State((done,), (walk.empty_stack(scene, options),), np.int32(0), ())
+        at_root = steps.visit_nodes(state._replace(places=(at_root,)), found).places[0]
+        heights = []
         for _ in range(3):
-            state = steps.visit_nodes(state, (walk.nothing_yet(ray),))
-        return state.places[0].child, steps.visit_nodes(at_root, (walk.nothing_yet(ray),)).places[0].child
+            state = steps.visit_nodes(state, found)
+            heights.append(state.places[0].height)
+        return state.places[0].child, at_root.child, np.int32(0) + sum(heights)
 
     after = np.array([visited(scene, row) for row in ready])
     assert (after[:, 0] == DONE).all()
     assert (after[:, 1] != DONE).any()
+    assert not after[:, 2].any()
+
+
+def with_last(nodes):
+    """The first node once more, last."""
+    return np.concatenate([nodes, nodes[:1]])
+
+
+@pytest.mark.parametrize("hierarchy", ["stored", "rebuilt"])
+def test_the_last_wide_node_is_met_by_none_and_has_no_children(ball, hierarchy):
+    """Rays that are done are there: nothing but its boxes keeps them from its children."""
+    for count in (1, 2, 8, 200):
+        scene = ball.subset(count) if hasattr(ball, "subset") else ball
+        last = np.asarray(Tracer(scene, device="cpu", threads=1, hierarchy=hierarchy)._scene.nodes)[-1]
+        assert np.isnan(last[:6]).all()
+        assert (last[6].view(np.int32) == DONE).all()
 
 
 def test_power_of_two_units_change_nothing(ball):

@@ -123,4 +123,4 @@ def entries_of(low: list[Array], high: list[Array], nearest: Array) -> tuple[Arr
     exits = [larger(a, b) for a, b in zip(low, high, strict=True)]
     entry = larger(larger(entries[0], entries[1]), larger(entries[2], jnp.float32(0)))
     leaving = smaller(exits[0], smaller(exits[1], exits[2])) * FAR_FACTOR
-    return entry, entry <= smaller(nearest, leaving)
+    return entry, (entry <= nearest) & (entry <= leaving)

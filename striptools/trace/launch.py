@@ -32,6 +32,10 @@ RAYS = PartitionSpec("device")
 EVERYWHERE = PartitionSpec()
 """The whole on each device."""
 
+LEFT_IN_LOOPS = {"xla_disable_hlo_passes": "while-loop-invariant-code-motion"}
+"""How programs are compiled: what is worked out before a loop, to save a load or a sum, is one more value
+that the loop carries, for which XLA's CPU backend stores a pointer in each turn."""
+
 _refused: set[WalkOptions] = set()
 """Options with which the kernel could not be compiled in this process."""
 
@@ -61,7 +65,7 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
         out_specs=RAYS,
         check_vma=False,
     )
-    return jax.jit(split)
+    return jax.jit(split, compiler_options=LEFT_IN_LOOPS)
 
 
 def _walk_of(options: WalkOptions, packets: bool) -> tuple[Any, int]:

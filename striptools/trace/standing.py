@@ -19,9 +19,9 @@ from jax import Array, lax
 
 from striptools.trace.box import Slab
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Corners, Shear, pick
+from striptools.trace.triangle import Corners, pick
 from striptools.trace.triangle_tests import IN_DOUBLE
-from striptools.trace.walk import Best, Decode, Leaf, WalkOptions, found_in
+from striptools.trace.walk import Best, Decode, Leaf, Sighted, WalkOptions, found_in
 from striptools.trace.walk_packed import first_corner
 
 
@@ -105,13 +105,13 @@ class Standing(NamedTuple):
 
         return Leaf(along(axes[0]), along(axes[1]), along(axes[2]), first_corner(x, y, z), filled, own.name)
 
-    def visit_leaf(self, shear: Shear, where: Any, best: Best, options: WalkOptions) -> Best:
+    def visit_leaf(self, ray: Sighted, where: Any, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf where they stand, against the closest hit so far."""
 
         def placed() -> Leaf:
-            return self.leaf_of(shear.axes, where, options.decode)
+            return self.leaf_of(ray.shear.axes, where, options.decode)
 
-        return found_in(placed, shear, best, options, self.geometries.faces_of if self.has_faces else None)
+        return found_in(placed, ray, best, options, self.geometries.faces_of if self.has_faces else None)
 
     def residual(self, own: Array, point: Array) -> tuple[Array, Array]:
         """By how much a point of the geometry (3,) stands beside one of the scene, computed in float64.

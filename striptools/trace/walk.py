@@ -15,8 +15,11 @@ Differences:
 3. A box is left out only where it is farther than the closest hit by more than `SLACK`, and of two hits at
    the same t the one of the smaller face is kept: the result does not depend on the order of visits.
 
-What the assembly taught: every value that a loop carries costs loads and stores in each turn; a stack
-inside a `lax.cond` is copied; a loop is hoisted only while nothing in it scatters, sorts or calls back.
+What the assembly taught: every value that a loop carries, and every one that a `lax.cond` is given from
+outside, costs loads and stores in each turn; what is worked out anew inside costs less. A stack inside a
+`lax.cond` is copied, and so is one of which something is read that does not lead to what is written. A loop
+is hoisted only while nothing in it scatters, sorts or calls back. A branch that goes either way costs more
+than a few dozen instructions.
 
 The steps of a walk are bounded: a tree that goes round in a circle ends in `STUCK`, not in a hang.
 """
@@ -43,6 +46,7 @@ from striptools.trace.numerics import (
     folded,
     in_range,
     index,
+    kept,
     larger,
     power_of_two_below,
     smaller,
@@ -154,6 +158,15 @@ class Leaf(NamedTuple):
         return Triangles(self.x, self.y, self.z, self.turn, self.filled)
 
 
+class Sighted(Protocol):
+    """What a triangle is seen along."""
+
+    @property
+    def shear(self) -> Shear:
+        """The ray as the triangle test sees it."""
+        ...
+
+
 class WalkScene(Protocol):
     """What a walk asks of a scene: a NamedTuple of arrays on a device."""
 
@@ -204,7 +217,7 @@ class WalkScene(Protocol):
         """The triangles of a leaf that `find_leaf` found, their corners along these axes."""
         ...
 
-    def visit_leaf(self, shear: Shear, where: Any, best: Best, options: "WalkOptions") -> Best:
+    def visit_leaf(self, ray: Sighted, where: Any, best: Best, options: "WalkOptions") -> Best:
         """Test the triangles of a leaf, against the closest hit so far."""
         ...
 
@@ -283,15 +296,27 @@ class Traced(NamedTuple):
     counted: Array
 
 
-class ReadyRay(NamedTuple):
-    """What stays the same all along a walk, in one array: a loop pays for each.
+@partial(jax.tree_util.register_dataclass, data_fields=["rows"], meta_fields=["number", "count"])
+@dataclass(frozen=True)
+class ReadyRay:
+    """What stays the same all along a walk, cut where it is used from one array: a loop pays for each.
 
     Attributes:
-        words: (24,) float32: 17 numbers that the properties name, then the bits of seven integers; (27,)
-            where the direction follows.
+        rows: (24 n,) float32, of n rays that are walked side by side: of each 17 numbers that the properties
+            name, then the bits of seven integers; (27 n,) where the directions follow.
+        number: Which of the rays it is.
+        count: How many there are.
     """
 
-    words: Array
+    rows: Array
+    number: int = 0
+    count: int = 1
+
+    @property
+    def words(self) -> Array:
+        """(24,) float32, or (27,)."""
+        size = len(self.rows) // self.count
+        return self.rows[self.number * size : (self.number + 1) * size]
 
     @property
     def floats(self) -> Array:
@@ -337,9 +362,14 @@ class ReadyRay(NamedTuple):
         return self.integer(3)
 
     @property
-    def start(self) -> "Place":
-        """Where the walk starts."""
-        return Place(self.integer(START) ^ DONE, jnp.int32(0), self.integer(5), jnp.int32(1))
+    def first(self) -> Array:
+        """The child to visit first, or `DONE`."""
+        return self.integer(START) ^ DONE
+
+    @property
+    def rest(self) -> Array:
+        """Lanes of the root that are left after it."""
+        return self.integer(5)
 
     @property
     def visited(self) -> Array:
@@ -361,15 +391,22 @@ def lane_bits_of(octant: Array, width: int) -> Array:
     """(width,) int32: the bit that stands for each lane, the nearest highest: a row of a constant table."""
     octants, lanes = np.arange(8, dtype=np.int32)[:, None], np.arange(width, dtype=np.int32)
     table = jnp.asarray(np.int32(1) << (lanes ^ mirror_of(octants, width)))
-    return lax.dynamic_slice(table, (index(octant), jnp.uint32(0)), (1, width))[0]
+    return lax.dynamic_slice(table, (index(octant & 7), jnp.uint32(0)), (1, width))[0]
+
+
+def names_leaf(child: Array) -> Array:
+    """Whether a child is a leaf: negative, but not `DONE`."""
+    return index(child) > np.uint32(2**31)
 
 
 class Place(NamedTuple):
-    """Where a ray is: the child to visit next, and the node it came from with the lanes that it has left."""
+    """Where a ray is: the child to visit next, and the place of the topmost entry of its stack.
+
+    An entry is a node and the lanes of it that are left, at least one: it goes with its last. Only at the
+    bottom there may be none, of the last node, which has no children: whatever is taken from it is `DONE`.
+    """
 
     child: Array
-    node: Array
-    lanes: Array
     height: Array
 
 
@@ -416,8 +453,8 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
         ready: (r, 24) or (r, 27) float32, as from `prepared_rays`; rows of zeros are rays that end at once.
         options: What to compile in.
     """
-    rows = ready.reshape(len(ready) // options.interleave, options.interleave, -1)
-    stacks = (_floor(scene, options),) * options.interleave
+    rows = ready.reshape(len(ready) // options.interleave, -1)
+    stacks = (empty_stack(scene, options),) * options.interleave
 
     def walk(stacks: tuple[Array, ...], group: Array) -> tuple[tuple[Array, ...], _Walked]:
         return _walk_group(scene, group, stacks, options)
@@ -433,10 +470,9 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
     return Traced(t, name, counters, counted.reshape(-1))
 
 
-def _floor(scene: Any, options: WalkOptions) -> Array:
-    """An empty stack: its bottom has a lane that no node has."""
-    bottom = jnp.array([scene.node_count - 1, 1 << scene.width], jnp.int32)
-    return jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
+def empty_stack(scene: Any, options: WalkOptions) -> Array:
+    """The stack of a ray that has nothing left to visit: at its bottom is the last node, with no lanes."""
+    return jnp.zeros((options.stack_size, 2), jnp.int32).at[0, 0].set(scene.node_count - 1)
 
 
 def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root: Array) -> Array:
@@ -506,40 +542,75 @@ def scaled_ray(
     return (ox, oy, oz), (x, y, z), finite
 
 
-def next_child(
+def entry_at(stack: Array, height: Array) -> tuple[Array, Array]:
+    """The node and its lanes left of an entry of a stack."""
+    entry = lax.dynamic_slice(stack, (_entry(stack, height), jnp.uint32(0)), (1, 2))[0]
+    return entry[0], entry[1]
+
+
+def with_entry(stack: Array, height: Array, node: Array, lanes: Array) -> Array:
+    """A stack with an entry in a place."""
+    entry = jnp.stack([node, lanes])[None]
+    return lax.dynamic_update_slice(stack, entry, (_entry(stack, height), jnp.uint32(0)))
+
+
+def _entry(stack: Array, height: Array) -> Array:
+    """A place in a stack of 2**k entries: the mask tells the compiler that it is inside."""
+    return index(height & (len(stack) - 1))
+
+
+def take_child(scene: WalkScene, octant: Array, node: Array, lanes: Array) -> tuple[Array, Array, Array]:
+    """The child in the nearest lane left, that lane, and the lanes without it."""
+    zeros = lax.clz(lanes)
+    # 31 less the zeros is the place of the bit.
+    lane = index(zeros ^ 31 ^ mirror_of(octant, scene.width))
+    left = lanes ^ lax.shift_right_logical(jnp.int32(-(2**31)), zeros & 31)
+    return scene.child_of(node, lane), lane, left
+
+
+def lowered(height: Array, empty: Array) -> Array:
+    """The height of a stack, one less where its topmost entry is empty, but not below the bottom."""
+    lower = height - empty.astype(jnp.int32)
+    return jnp.where(lower < 0, 0, lower)
+
+
+def step_down(
     scene: WalkScene, octant: Array, node: Array, lanes: Array, height: Array, stack: Array
-) -> tuple[Place, Array]:
-    """Take the nearest lane left, of the node at hand or the one on top of the stack: its child, and it."""
+) -> tuple[Place, Array, Array, Array]:
+    """Go on from a node at its nearest lane met, or at the topmost entry of the stack where none was met.
 
-    def top() -> tuple[Array, Array, Array]:
-        entry = lax.dynamic_slice(stack, (index(height - 1), jnp.uint32(0)), (1, 2))[0]
-        return entry[0], entry[1], height - 1
+    Without a branch: which it is cannot be guessed.
 
-    # A branch, so that the processor guesses and goes on.
-    node, lanes, height = lax.cond(lanes == 0, top, lambda: (node, lanes, height))
-    order = 31 - lax.clz(lanes)
-    lane = index(order ^ mirror_of(octant, scene.width))
-    # The lane at the bottom of a stack stays: a ray that is done is done again.
-    left = lanes ^ ((jnp.int32(1) << order) & ((1 << scene.width) - 1))
-    return Place(scene.child_of(node, lane), node, left, height), lane
+    Args:
+        scene: What is walked.
+        octant: Of the ray.
+        node: The one visited.
+        lanes: Those met, as bits in the order of visits.
+        height: Of the topmost entry.
+        stack: (2**k, 2) int32.
 
-
-def _at_bottom(scene: WalkScene) -> Place:
-    """Where a ray is that has nothing left to visit."""
-    return Place(jnp.int32(DONE), jnp.int32(scene.node_count - 1), jnp.int32(1 << scene.width), jnp.int32(0))
+    Returns:
+        The place, the node and the lane that its child is in, and the stack.
+    """
+    below = entry_at(stack, height)
+    # Shifted by one, or the compiler makes a branch of each choice: no lane has the highest bit.
+    none = (lanes << 1) == 0
+    node = kept(jnp.where(none, below[0], node))
+    height = kept(jnp.where(none, height, height + 1))
+    child, lane, left = take_child(scene, octant, node, kept(jnp.where(none, below[1], lanes)))
+    stack = with_entry(stack, height, node, left)
+    return Place(child, lowered(height, left == 0)), node, lane, stack
 
 
 def _visit_node(
     scene: WalkScene, ray: ReadyRay, place: Place, limit: Array, stack: Array
 ) -> tuple[Place, Array]:
-    """Put what is left of the last node on the stack, test this one's boxes, and choose the next child."""
-    entry = jnp.stack([place.node, place.lanes])[None]
-    stack = lax.dynamic_update_slice(stack, entry, (index(place.height), jnp.uint32(0)))
-    height = jnp.where(place.lanes != 0, place.height + 1, place.height)
-    # No ray is at a leaf, but one may be done: it goes through the motions, and no box is near enough.
-    met = scene.lanes_met(place.child, ray.slab, jnp.where(place.child >= 0, limit, np.float32(-1)))
+    """Test the boxes of a node's children, and choose the next child."""
+    # No ray is at a leaf, but one may be done: it goes through the motions, and meets nothing.
+    met = scene.lanes_met(place.child, ray.slab, limit)
     lanes = jnp.sum(jnp.where(met, lane_bits_of(ray.octant, scene.width), 0))
-    return next_child(scene, ray.octant, place.child, lanes, height, stack)[0], stack
+    there, _, _, stack = step_down(scene, ray.octant, place.child, lanes, place.height, stack)
+    return there, stack
 
 
 def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array] | None = None) -> Best:
@@ -552,17 +623,32 @@ def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array]
         faces_of: Where names are not faces, the faces of (8,) names.
     """
     hit = (t > 0) & (t <= best.nearest)
+    if faces_of is None:
+        return _least(best, t, name, hit)
 
     def replace() -> Best:
         nearest = folded(jnp.where(hit, t, np.float32(jnp.inf)), smaller)
         names = jnp.where(t == nearest, name, NO_NAME)
         least = folded(names, smaller)
-        new = (nearest < best.nearest) | (least < best.name)
-        if faces_of is not None:
-            least, new = _first_by_face(faces_of, names, least, nearest, best)
+        least, new = _first_by_face(faces_of, names, least, nearest, best)
         return Best(nearest, jnp.where(new, least, best.name))
 
     return lax.cond(any_lane(hit), replace, lambda: best)
+
+
+def _least(best: Best, t: Array, name: Array, hit: Array) -> Best:
+    """By one number for both: of a t that is not negative the bits are ordered as it is."""
+    with jax.enable_x64(True):
+
+        def number(t: Array, name: Array) -> Array:
+            bits = lax.bitcast_convert_type(t, jnp.int32).astype(jnp.int64)
+            return bits << 32 | (name + np.int32(1)).astype(jnp.uint32).astype(jnp.int64)
+
+        none = np.int64(2**63 - 1)
+        least = lax.reduce(jnp.where(hit, number(t, name), none), none, lax.min, (0,))
+        least = lax.min(least, number(best.nearest, best.name))
+        nearest = lax.bitcast_convert_type((least >> 32).astype(jnp.int32), jnp.float32)
+        return Best(nearest, least.astype(jnp.int32) - np.int32(1))
 
 
 def _first_by_face(
@@ -586,7 +672,7 @@ def _first_by_face(
 
 def found_in(
     at_hand: Callable[[], Leaf],
-    shear: Shear,
+    ray: Sighted,
     best: Best,
     options: "WalkOptions",
     faces_of: Callable[[Array], Array] | None = None,
@@ -595,19 +681,19 @@ def found_in(
 
     Args:
         at_hand: Makes the leaf.
-        shear: Of the ray.
+        ray: Which has a shear; it is asked for where it is used, or a cond keeps each number for itself.
         best: So far.
         options: By which test, and whether any hit will do.
         faces_of: As of `nearer`.
     """
     leaf = at_hand()
-    t = leaf.crossings(shear, test=options.test, again=at_hand)
+    t = leaf.crossings(ray.shear, test=options.test, again=at_hand)
     return found_any(best, t) if options.any_hit else nearer(best, t, leaf.name, faces_of)
 
 
 def sifted(
     at_hand: Callable[[], Leaf],
-    shear: Shear,
+    ray: Sighted,
     best: Best,
     options: "WalkOptions",
     faces_of: Callable[[Array], Array] | None = None,
@@ -619,11 +705,11 @@ def sifted(
     """
 
     def found() -> Best:
-        return found_in(at_hand, shear, best, options, faces_of)
+        return found_in(at_hand, ray, best, options, faces_of)
 
     if options.batch or options.test != "watertight":
         return found()
-    return lax.cond(any_lane(at_hand().may_cross(shear, best.nearest)), found, lambda: best)
+    return lax.cond(any_lane(at_hand().may_cross(ray.shear, best.nearest)), found, lambda: best)
 
 
 def found_any(best: Best, t: Array) -> Best:
@@ -655,8 +741,14 @@ class _Walk:
     """The steps of the walk of one group of rays."""
 
     scene: WalkScene
-    rays: tuple[ReadyRay, ...]
+    group: Array
     options: WalkOptions
+
+    @property
+    def rays(self) -> tuple[ReadyRay, ...]:
+        """They are cut from the group where they are used."""
+        count = self.options.interleave
+        return tuple(ReadyRay(self.group, k, count) for k in range(count))
 
     def goes_on(self, state: _State, at: Callable[[Place], Array]) -> Array:
         """Whether any ray is `at` a place, and the walk within its bound: each ray at each node once."""
@@ -669,7 +761,7 @@ class _Walk:
         """Whether some ray is at an inner node and none at a leaf: one that is there is not kept waiting."""
         none_at_leaf = jnp.bool_(True)
         for place in state.places:
-            none_at_leaf = none_at_leaf & ((place.child >= 0) | (place.child == DONE))
+            none_at_leaf = none_at_leaf & ~names_leaf(place.child)
         return none_at_leaf & self.goes_on(state, lambda place: place.child >= 0)
 
     def visit_nodes(self, state: _State, bests: tuple[Found, ...]) -> _State:
@@ -686,16 +778,16 @@ class _Walk:
 
     def visit_leaves(self, state: _State, bests: tuple[Found, ...]) -> tuple[_State, tuple[Found, ...]]:
         """Each ray that is at a leaf tests it and goes on."""
-        at_leaf = [(place.child < 0) & (place.child != DONE) for place in state.places]
+        at_leaf = [names_leaf(place.child) for place in state.places]
         # Found for all rays at once: one's loads go on while another's are waited for.
         where = [self.scene.find_leaf(place.child) for place in state.places]
+        bests = tuple(
+            lax.cond(at_leaf[k], partial(self.test_leaf, k, bests[k], where[k]), partial(self.stay, bests[k]))
+            for k in range(len(bests))
+        )
         after = [
-            lax.cond(
-                at_leaf[k],
-                partial(self.leave_leaf, k, state, bests[k], where[k]),
-                partial(self.stay, k, state, bests[k]),
-            )
-            for k in range(len(self.rays))
+            self.leave_leaf(*each)
+            for each in zip(self.rays, state.places, state.stacks, at_leaf, bests, strict=True)
         ]
         visits = self.count(state.visits, at_leaf, _A_LEAF)
         if visits:
@@ -704,25 +796,32 @@ class _Walk:
                 for there, leaf in zip(at_leaf, where, strict=True)
             ]
             visits = tuple(each + _A_TRIANGLE * count for each, count in zip(visits, tested, strict=True))
-        return state._replace(places=tuple(a[0] for a in after), visits=visits), tuple(a[1] for a in after)
+        return _State(tuple(a[0] for a in after), tuple(a[1] for a in after), state.turns, visits), bests
 
-    def leave_leaf(self, k: int, state: _State, best: Found, where: Any) -> tuple[Place, Found]:
-        """Ray k tests its leaf and takes the next child. The stack is read here, never returned: no copy."""
-        ray, place = self.rays[k], state.places[k]
+    def test_leaf(self, k: int, best: Found, where: Any) -> Found:
+        """Ray k tests its leaf."""
+        ray = self.rays[k]
         if isinstance(best, Gathered):
-            best = gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
-        else:
-            best = self.scene.visit_leaf(ray.shear, where, best, self.options)
-        there, _ = next_child(self.scene, ray.octant, place.node, place.lanes, place.height, state.stacks[k])
+            return gather_leaf(self.scene, ray.shear, ray.t_max, where, best, self.options)
+        return self.scene.visit_leaf(ray, where, best, self.options)
+
+    def stay(self, best: Found) -> Found:
+        """A ray that is at no leaf finds nothing."""
+        return best
+
+    def leave_leaf(
+        self, ray: ReadyRay, place: Place, stack: Array, there: Array, best: Found
+    ) -> tuple[Place, Array]:
+        """A ray that is at a leaf takes the next child, not in a cond, where the stack would be copied."""
+        node, lanes = map(kept, entry_at(stack, place.height))
+        child, _, left = take_child(self.scene, ray.octant, node, lanes)
+        stack = with_entry(stack, place.height, node, jnp.where(there, left, lanes))
+        child = jnp.where(there, child, place.child)
+        height = lowered(place.height, there & (left == 0))
         if self.options.any_hit:
             found = best.nearest < ray.t_max
-            bottom = _at_bottom(self.scene)
-            there = Place(*(jnp.where(found, a, b) for a, b in zip(bottom, there, strict=True)))
-        return there, best
-
-    def stay(self, k: int, state: _State, best: Found) -> tuple[Place, Found]:
-        """Ray k is at no leaf."""
-        return state.places[k], best
+            child, height = jnp.where(found, DONE, child), jnp.where(found, 0, height)
+        return Place(child, height), stack
 
     def count(
         self, visits: tuple[Array, ...], there: list[Array], one: Int32[np.ndarray, " 3"]
@@ -737,10 +836,9 @@ def _walk_group(
     scene: WalkScene, group: Array, stacks: tuple[Array, ...], options: WalkOptions
 ) -> tuple[tuple[Array, ...], _Walked]:
     """Walk `options.interleave` rays side by side."""
-    rays = tuple(ReadyRay(row) for row in group)
-    state, bests = _walked(
-        _Walk(scene, rays, options), stacks, tuple(_nothing_found(r, options) for r in rays)
-    )
+    walk = _Walk(scene, group, options)
+    rays = walk.rays
+    state, bests = _walked(walk, stacks, tuple(_nothing_found(ray, options) for ray in rays))
     results = [_result(scene, *each, options.any_hit) for each in zip(rays, state.places, bests, strict=True)]
     t, name, count = (jnp.stack([r[k] for r in results]) for k in range(3))
     counters = jnp.zeros((len(rays), 0), jnp.int32)
@@ -751,7 +849,11 @@ def _walk_group(
 
 def _walked(walk: _Walk, stacks: tuple[Array, ...], bests: tuple[Any, ...]) -> tuple[_State, tuple[Any, ...]]:
     """Walk until no ray has anything left to visit."""
-    places = tuple(ray.start for ray in walk.rays)
+    stacks = tuple(
+        with_entry(stack, jnp.int32(1), jnp.int32(0), ray.rest)
+        for stack, ray in zip(stacks, walk.rays, strict=True)
+    )
+    places = tuple(Place(ray.first, (ray.rest != 0).astype(jnp.int32)) for ray in walk.rays)
     visits = tuple(ray.visited * _A_NODE for ray in walk.rays) if walk.options.counting else ()
 
     def nodes_then_leaves(carried: tuple[_State, tuple[Any, ...]]) -> tuple[_State, tuple[Any, ...]]:
@@ -788,7 +890,9 @@ def walk_alone(
     """
     ray = ReadyRay(row)
     best = _nothing_found(ray, options) if nothing is None else nothing(ray)
-    state, bests = _walked(_Walk(scene, (ray,), options), (_floor(scene, options),), (best,))
+    state, bests = _walked(
+        _Walk(scene, row, options._replace(interleave=1)), (empty_stack(scene, options),), (best,)
+    )
     visits = state.visits[0] if state.visits else jnp.zeros(3, jnp.int32)
     return Alone(ray, state.places[0].child == DONE, bests[0], visits)
 
@@ -796,7 +900,7 @@ def walk_alone(
 def found_alone(scene: Any, end: Alone, any_hit: bool) -> tuple[Array, Array]:
     """What is reported of the walk of one ray: t in the caller's units, and the name of the triangle."""
     child = jnp.where(end.ended, DONE, 0)
-    place = Place(child, child, child, child)
+    place = Place(child, child)
     return _result(scene, end.ray, place, end.best, any_hit)[:2]
 
 

@@ -92,7 +92,7 @@ def _walk(scene: BinaryScene, ray: ReadyRay, stack: Array, options: WalkOptions)
     def goes_on(carried: tuple[_Place, Best, Counters]) -> Array:
         return (carried[0].child != DONE) & (carried[0].turns <= bound)
 
-    start = _Place(ray.start.child, jnp.int32(0), stack, jnp.int32(0))
+    start = _Place(ray.first, jnp.int32(0), stack, jnp.int32(0))
     place, best, counted = lax.while_loop(goes_on, down_then_leaf, (start, nothing_yet(ray), no_counts()))
     turns = place.turns
     counted = counted._replace(nodes=turns, boxes=2 * turns + 1, node_bytes=NODE_BYTES * turns)

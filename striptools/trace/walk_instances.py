@@ -65,6 +65,7 @@ from striptools.trace.walk import (
     Alone,
     Frame,
     ReadyRay,
+    Sighted,
     Traced,
     WalkOptions,
     found_alone,
@@ -276,14 +277,14 @@ class _Seen(NamedTuple):
         """Triangles are counted in the geometries."""
         return jnp.int32(0)
 
-    def visit_leaf(self, shear: Shear, where: Array, best: Any, options: WalkOptions) -> Any:
+    def visit_leaf(self, ray: Sighted, where: Array, best: Any, options: WalkOptions) -> Any:
         """Walk the geometry of an instance."""
         number = -(where + 1)
         # A GPU goes through the motions for rays that are at no leaf.
         there = (where < 0) & (where != DONE)
         limit = jnp.where(there, best.limit, 0)
         if self.in_place:
-            seen, row = self._standing_at(index(number), limit, shear)
+            seen, row = self._standing_at(index(number), limit, ray.shear)
         else:
             seen, row = self._moved_into(index(number), limit)
         return best.after(number, seen, walk_alone(seen, row, options), options)

@@ -37,7 +37,7 @@ from jax import Array, lax
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Corners, Shear, pick
+from striptools.trace.triangle import Corners, pick
 from striptools.trace.walk import (
     DONE,
     WIDTH,
@@ -45,6 +45,7 @@ from striptools.trace.walk import (
     Decode,
     Frame,
     Leaf,
+    Sighted,
     Traced,
     WalkOptions,
     found_in,
@@ -122,6 +123,7 @@ class PackedScene(NamedTuple):
             near, far = ((origin + (planes[row] << shift)).astype(jnp.float32) for row in (axis, axis + 3))
             low.append(near * slab.inverse[axis] - slab.low[axis])
             high.append(far * slab.inverse[axis] - slab.high[axis])
+        limit = jnp.where(node >= 0, limit, np.float32(-1))
         return passes(low, high, limit) & (planes[0] <= planes[3])
 
     def boxes_of(self, node: Array) -> Array:
@@ -228,15 +230,15 @@ class PackedScene(NamedTuple):
         corners = self._corners(header, where.said, decode.flips)
         return self._positions(header, corners, axes, decode)
 
-    def visit_leaf(self, shear: Shear, where: "_Run", best: Best, options: WalkOptions) -> Best:
+    def visit_leaf(self, ray: Sighted, where: "_Run", best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, against the closest hit so far."""
 
         def decoded() -> Leaf:
-            return self.leaf_of(shear.axes, where, options.decode)
+            return self.leaf_of(ray.shear.axes, where, options.decode)
 
         # For any hit a leaf is cheaper tested at once than decoded twice.
         find = found_in if options.any_hit else sifted
-        return find(decoded, shear, best, options, self.faces_of if self.has_faces else None)
+        return find(decoded, ray, best, options, self.faces_of if self.has_faces else None)
 
     def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""

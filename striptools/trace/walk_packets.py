@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.kernels.packets import HEAD, PACKET
-from striptools.trace.numerics import ends_of, folded, in_range, index, larger, smaller
+from striptools.trace.numerics import ends_of, folded, in_range, index, kept, larger, smaller
 from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
@@ -43,9 +43,15 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     WalkScene,
+    empty_stack,
+    entry_at,
     lane_bits_of,
-    next_child,
+    lowered,
+    names_leaf,
     sifted,
+    step_down,
+    take_child,
+    with_entry,
 )
 
 FAR = np.float32(3.0e38)
@@ -147,6 +153,18 @@ class _Packet(NamedTuple):
         return Shear(self.axes, (ray[0], ray[1], ray[2]), ray[3], ray[4], ray[5])
 
 
+class _Ray(NamedTuple):
+    """One ray of a packet."""
+
+    packet: _Packet
+    lane: Array
+
+    @property
+    def shear(self) -> Shear:
+        """As of `walk.ReadyRay`."""
+        return self.packet.shear_of(self.lane)
+
+
 class _Found(NamedTuple):
     """What the rays have found: (32,) each, and the depth beyond which nothing matters."""
 
@@ -174,13 +192,11 @@ def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Trac
     Returns:
         Of the rays of each packet, (p, 32).
     """
-    bottom = jnp.array([scene.node_count - 1, 1 << scene.width], jnp.int32)
-    stack = jnp.zeros((options.stack_size, 2), jnp.int32).at[0].set(bottom)
 
     def walk(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
         return _walk_packet(scene, _packet_of(row), stack, options)
 
-    t, name = lax.scan(walk, stack, ready)[1]
+    t, name = lax.scan(walk, empty_stack(scene, options), ready)[1]
     return Traced(
         jnp.zeros(0) if options.any_hit else t, name, jnp.zeros(0, jnp.int32), jnp.zeros(0, jnp.int32)
     )
@@ -288,7 +304,7 @@ def _one_ray(
     """Test one ray against eight triangles."""
     before = Best(*(lax.dynamic_slice(a, (lane,), (1,))[0] for a in (t, name)))
     faces_of = scene.faces_of if scene.has_faces else None
-    best = sifted(at_hand, packet.shear_of(lane), before, options._replace(any_hit=False), faces_of)
+    best = sifted(at_hand, _Ray(packet, lane), before, options._replace(any_hit=False), faces_of)
     return (
         lax.dynamic_update_slice(t, best.nearest[None], (lane,)),
         lax.dynamic_update_slice(name, best.name[None], (lane,)),
@@ -327,14 +343,15 @@ def _limit(packet: _Packet, t: Array) -> Array:
 
 def _box_of(scene: PacketScene, packet: _Packet, state: "_State") -> _Box:
     """The box of the leaf at hand, as its node has it."""
-    x0, x1, y0, y1, z0, z1 = scene.sides_in(state.place.node, packet.rows, state.lane)
+    x0, x1, y0, y1, z0, z1 = scene.sides_in(state.node, packet.rows, state.lane)
     return _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
 
 
 class _State(NamedTuple):
-    """Where a packet is; the lane is where the node that it came from has the child at hand."""
+    """Where a packet is; the node that it came from has the child at hand in this lane."""
 
     place: Place
+    node: Array
     lane: Array
     stack: Array
     turns: Array
@@ -348,30 +365,34 @@ def _walk_packet(
 
     def visit_node(state: _State, limit: Array) -> _State:
         place = state.place
-        entry = jnp.stack([place.node, place.lanes])[None]
-        stack = lax.dynamic_update_slice(state.stack, entry, (index(place.height), jnp.uint32(0)))
-        height = jnp.where(place.lanes != 0, place.height + 1, place.height)
         x0, x1, y0, y1, z0, z1 = scene.sides_of(place.child, packet.rows)
         box = _Box((x0, x1), (y0, y1), (z0 * packet.sign, z1 * packet.sign))
         met = _meets(packet, box, limit)
         lanes = jnp.sum(jnp.where(met, lane_bits, 0))
-        there = next_child(scene, packet.octant, place.child, lanes, height, stack)
-        return _State(*there, stack, state.turns + 1)
+        there = step_down(scene, packet.octant, place.child, lanes, place.height, state.stack)
+        return _State(*there, state.turns + 1)
 
-    def leave_leaf(state: _State, found: _Found) -> tuple[Place, Array, _Found]:
-        place = state.place
+    def test_leaf(state: _State, found: _Found) -> _Found:
         # Before rays are tested, which goes on while its loads are waited for.
-        where = scene.find_leaf(place.child)
+        where = scene.find_leaf(state.place.child)
         # Between the rays of a packet there may be room for a leaf: then it is not even read.
         rays = _bits(_rays_in(packet, _box_of(scene, packet, state), found.t))
-        found = lax.cond(
+        return lax.cond(
             rays != 0,
             lambda: _test_leaf(scene, packet, where, rays, found, options),
             lambda: found,
         )
-        there, lane = next_child(scene, packet.octant, place.node, place.lanes, place.height, state.stack)
+
+    def leave_leaf(state: _State, found: _Found) -> _State:
+        place = state.place
+        node, lanes = map(kept, entry_at(state.stack, place.height))
+        child, lane, left = take_child(scene, packet.octant, node, lanes)
+        there = names_leaf(place.child)
+        stack = with_entry(state.stack, place.height, node, jnp.where(there, left, lanes))
+        place = Place(jnp.where(there, child, place.child), lowered(place.height, there & (left == 0)))
         done = found.limit < 0
-        return there._replace(child=jnp.where(done, DONE, there.child)), lane, found
+        place = place._replace(child=jnp.where(done, DONE, place.child))
+        return _State(place, node, lane, stack, state.turns)
 
     def nodes_then_leaf(carried: tuple[_State, _Found]) -> tuple[_State, _Found]:
         state, found = carried
@@ -380,17 +401,13 @@ def _walk_packet(
             lambda s: visit_node(s, found.limit),
             state,
         )
-        place, lane, found = lax.cond(
-            (state.place.child < 0) & (state.place.child != DONE),
-            lambda: leave_leaf(state, found),
-            lambda: (state.place, state.lane, found),
-        )
-        return state._replace(place=place, lane=lane), found
+        found = lax.cond(names_leaf(state.place.child), lambda: test_leaf(state, found), lambda: found)
+        return leave_leaf(state, found), found
 
     zero = jnp.int32(0)
     found = _Found(packet.rays[6], jnp.full(PACKET, MISS), _limit(packet, packet.rays[6]))
     first = jnp.where(folded(packet.rays[6], larger) > 0, zero, DONE)
-    state = _State(Place(first, zero, zero, jnp.int32(1)), jnp.uint32(0), stack, zero)
+    state = _State(Place(first, zero), zero, jnp.uint32(0), stack, zero)
     state, found = lax.while_loop(
         lambda carried: (carried[0].place.child != DONE) & (carried[0].turns <= scene.node_count),
         nodes_then_leaf,

@@ -87,7 +87,7 @@ def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack:
 
 def is_live(ray: ReadyRay) -> Array:
     """() bool: whether there is anything to walk."""
-    return ray.start.child != DONE
+    return ray.first != DONE
 
 
 def no_counts() -> Counters:

@@ -10,12 +10,12 @@ from striptools.trace.box import Slab, lanes_met
 from striptools.trace.counters import Counters
 from striptools.trace.leaf_blocks import leaf_in, triangles_in
 from striptools.trace.numerics import index
-from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
     Best,
     Decode,
     Frame,
     Leaf,
+    Sighted,
     Traced,
     WalkOptions,
     sifted,
@@ -69,20 +69,22 @@ class WideScene(NamedTuple):
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; leaf q is -(q + 1)."""
-        bits = lax.dynamic_slice(self.nodes, (index(node), jnp.uint32(6), lane), (1, 1, 1))[0, 0, 0]
+        # What is known to be a lane is not compared with the number of lanes.
+        at = index(node), jnp.uint32(6), lane & (self.width - 1)
+        bits = lax.dynamic_slice(self.nodes, at, (1, 1, 1))[0, 0, 0]
         return lax.bitcast_convert_type(bits, jnp.int32)
 
     def find_leaf(self, child: Array) -> Array:
         """The block of a leaf."""
         return index(-(child + 1))
 
-    def visit_leaf(self, shear: Shear, where: Array, best: Best, options: WalkOptions) -> Best:
+    def visit_leaf(self, ray: Sighted, where: Array, best: Best, options: WalkOptions) -> Best:
         """Test the triangles of a leaf, against the closest hit so far."""
 
         def at_hand() -> Leaf:
-            return leaf_in(self.blocks, where, shear.axes)
+            return leaf_in(self.blocks, where, ray.shear.axes)
 
-        return sifted(at_hand, shear, best, options)
+        return sifted(at_hand, ray, best, options)
 
     def leaf_of(self, axes: tuple[Array, Array, Array], where: Array, decode: Decode | None) -> Leaf:
         """The triangles of a leaf, their corners along these axes."""

@@ -185,7 +185,7 @@ class _State(NamedTuple):
     Attributes:
         row: Which rays they are; `_Walk.nowhere` where there is none.
         ray: What stays the same along a walk.
-        child: As of `walk.Place`, and so are `node` and `lanes`.
+        child: The next to visit, as of `walk.Place`; it is of `node`, which has `lanes` left.
         visits: Nodes visited.
         height: Entries of the stack, where some may lie in memory.
         stack: Its upper `SHORT` entries, the top first: `node << 8 | lanes`, 0 where there is none.
