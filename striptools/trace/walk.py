@@ -606,7 +606,8 @@ def _visit_node(
     scene: WalkScene, ray: ReadyRay, place: Place, limit: Array, stack: Array
 ) -> tuple[Place, Array]:
     """Test the boxes of a node's children, and choose the next child."""
-    # No ray is at a leaf, but one may be done: it goes through the motions, and meets nothing.
+    # No ray is at a leaf, but one may be done: it goes through the motions, and no box is near enough.
+    limit = jnp.where(place.child >= 0, limit, np.float32(-1))
     met = scene.lanes_met(place.child, ray.slab, limit)
     lanes = jnp.sum(jnp.where(met, lane_bits_of(ray.octant, scene.width), 0))
     there, _, _, stack = step_down(scene, ray.octant, place.child, lanes, place.height, stack)

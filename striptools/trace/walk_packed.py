@@ -123,7 +123,6 @@ class PackedScene(NamedTuple):
             near, far = ((origin + (planes[row] << shift)).astype(jnp.float32) for row in (axis, axis + 3))
             low.append(near * slab.inverse[axis] - slab.low[axis])
             high.append(far * slab.inverse[axis] - slab.high[axis])
-        limit = jnp.where(node >= 0, limit, np.float32(-1))
         return passes(low, high, limit) & (planes[0] <= planes[3])
 
     def boxes_of(self, node: Array) -> Array:
