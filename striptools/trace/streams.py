@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding
+from jax.sharding import Mesh
 
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
@@ -22,7 +22,7 @@ from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.threads import at_once
 from striptools.trace.device import quiet_jax
-from striptools.trace.launch import RAYS, TILES, device_mesh, program
+from striptools.trace.launch import TILES, device_mesh, program
 from striptools.trace.layout import Layout, Rays
 from striptools.trace.leaves import aligned_zeros
 from striptools.trace.triangle_tests import wants_way
@@ -95,11 +95,12 @@ def trace_ready(
     count = len(rays[0])
     width = row_width(*rays[:2]) if packets else 0
     order = tile_order(count, width) if width else EVERY_RAY
+    cells = _cells_of(layout) if layout.nbytes >= LEAST_SORTED else None
     hands = stations[: max(1, min(len(stations), count // MANY))]
 
     def trace(hand: int, stopped: Event) -> None:
         which = deal(order, count, hand, len(hands), BLOCK) if len(hands) > 1 else order
-        course = _Course(hands[hand], layout, rays, which, dropped, options)
+        course = _Course(hands[hand], layout, cells, rays, which, dropped, options)
         for found in course.packets() if packets else course.singles():
             if stopped.is_set():
                 return
@@ -119,6 +120,8 @@ class _Course(NamedTuple):
     Attributes:
         station: The device.
         layout: The scene on this side.
+        cells: Where the cells begin that rays are sorted by, and how many there are in a unit of length; None
+            for a scene for which none are.
         rays: All there are.
         which: Those that go this way, in this order, int32; (0,) for all of them.
         dropped: As of `trace_ready`, and so is what follows.
@@ -127,6 +130,7 @@ class _Course(NamedTuple):
 
     station: Station
     layout: Layout
+    cells: tuple[np.ndarray, np.float32] | None
     rays: Rays
     which: np.ndarray
     dropped: np.ndarray
@@ -179,10 +183,10 @@ class _Course(NamedTuple):
 
     def _in_order(self, which: np.ndarray) -> Iterator[np.ndarray]:
         """Rays as they come; where most jump about in a large scene, sorted, so that neighbours go alike."""
-        if self.layout.nbytes < LEAST_SORTED:
+        if self.cells is None:
             yield which
             return
-        low, finer = _cells_of(self.layout)
+        low, finer = self.cells
         if not start_apart(self.rays[0], which, finer):
             yield which
             return
@@ -192,7 +196,7 @@ class _Course(NamedTuple):
 
 
 def _cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
-    """Where the cells begin that rays are sorted by, and how many there are in a unit of length."""
+    """See `_Course.cells`."""
     frame, box = layout.arrays.frame, layout.root[0]
     corners = np.stack([np.nanmin(box[:3], axis=1), np.nanmax(box[3:6], axis=1)]).astype(np.float64)
     low, high = (corners * frame.unit + frame.low) / frame.scale
@@ -228,7 +232,6 @@ class _Pipe:
     ) -> None:
         self._scene, self._sizes, self._lanes = station.scene, sizes, lanes
         self._compiled = program(station.mesh, options, bool(lanes))
-        self._place = NamedSharding(station.mesh, RAYS)
         self._shape = next((size for size in sizes if size >= shape[0]), sizes[-1]), shape[1]
         self._spare: list[_Buffers] = []
         self._filling: _Buffers | None = None
@@ -265,7 +268,8 @@ class _Pipe:
         rows = buffers.rows[: next(size for size in self._sizes if size >= live)]
         # Rows of zeros end at once.
         rows[live:] = 0
-        traced = self._compiled(self._scene, jax.device_put(rows, self._place))
+        # As they are: to put them on the device, where they lie already, takes longer than the call.
+        traced = self._compiled(self._scene, rows)
         self._waiting.append((live, traced, buffers))
         if len(self._waiting) >= IN_FLIGHT:
             yield self._collect()
