@@ -109,7 +109,7 @@ def test_a_loop_that_is_not_hoisted_would_be_seen():
 
 
 def copied_in_loops(text, shape):
-    """Copies of an array of this shape that a compiled program makes in loops, not before the first of them."""
+    """Copies of an array of this shape that a compiled program makes in loops, not before them."""
     copies = re.findall(rf"= {re.escape(shape)}\S* copy\([^\n]*", text)
     return [line for line in copies if "/while" in line]
 

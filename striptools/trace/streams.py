@@ -28,7 +28,7 @@ from striptools.trace.leaves import aligned_zeros
 from striptools.trace.triangle_tests import wants_way
 from striptools.trace.walk import WalkOptions, WalkScene
 
-PACKET_TILES = (2**3, 2**7, 2**11)
+PACKET_TILES = (2**3, 2**7, 2**12)
 """Packets that a device takes at once."""
 
 MANY = 2**13

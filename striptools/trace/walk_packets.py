@@ -229,19 +229,16 @@ def _meets(packet: _Packet, box: _Box, limit: Array) -> Array:
 
 
 def _rays_in(packet: _Packet, box: _Box, t: Array) -> Array:
-    """Which rays meet one box, nearer than their closest hit: (32,) bool."""
+    """Which rays meet one box, or would behind their origins, nearer than their closest hit: (32,) bool."""
     shear, margin = packet.shear, packet.margin
     near = (box.z[0] - margin) * packet.sign - shear.origin[2]
     far = (box.z[1] + margin) * packet.sign - shear.origin[2]
 
     def inside(sides: tuple[Array, Array], origin: Array, slope: Array) -> Array:
-        one, other = slope * near, slope * far
-        return (smaller(one, other) <= sides[1] + margin - origin) & (
-            larger(one, other) >= sides[0] - margin - origin
-        )
+        one, other = origin + slope * near, origin + slope * far
+        return (smaller(one, other) <= sides[1] + margin) & (larger(one, other) >= sides[0] - margin)
 
-    first, last = near * shear.z, far * shear.z
-    along = (larger(first, last) >= 0) & (smaller(first, last) <= t * SLACK)
+    along = near * shear.z <= t * SLACK
     return along & inside(box.x, shear.origin[0], shear.x) & inside(box.y, shear.origin[1], shear.y)
 
 
