@@ -67,7 +67,7 @@ def counts(trace: Gather, rays: Rays, kind: GatherKind) -> Int32[np.ndarray, " r
 
 def check_ended(name: np.ndarray) -> None:
     """Raise a StriptoolsError where a walk did not end."""
-    # One look at them for what is never so.
+    # The least tells, in one pass, what is hardly ever so.
     if name.size > 0 and name.min() <= STUCK:
         stuck = int((name <= STUCK).sum())
         raise StriptoolsError(

@@ -33,8 +33,8 @@ EVERYWHERE = PartitionSpec()
 """The whole on each device."""
 
 LEFT_IN_LOOPS = {"xla_disable_hlo_passes": "while-loop-invariant-code-motion"}
-"""How programs are compiled: what is worked out before a loop, to save a load or a sum, is one more value
-that the loop carries, for which XLA's CPU backend stores a pointer in each turn."""
+"""How programs are compiled for a CPU: what XLA works out before a loop, to save a load or a sum, is one more
+value that the loop carries, for which its CPU backend stores a pointer in each turn."""
 
 _refused: set[WalkOptions] = set()
 """Options with which the kernel could not be compiled in this process."""
@@ -65,7 +65,8 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
         out_specs=RAYS,
         check_vma=False,
     )
-    return jax.jit(split, compiler_options=LEFT_IN_LOOPS)
+    on_cpu = mesh.devices.flat[0].platform == "cpu"
+    return jax.jit(split, compiler_options=LEFT_IN_LOOPS if on_cpu else None)
 
 
 def _walk_of(options: WalkOptions, packets: bool) -> tuple[Any, int]:

@@ -127,25 +127,25 @@ class WideScene(NamedTuple):
 # Notes
 #
 # Tried on the dragon's strip hierarchy, one thread, Zen 4, and lost (time against what stands here): leaf
-# test without lax.cond 1.09; four rays side by side 1.05 to 1.2, one 1.1; the node and its lanes always read
-# back from the stack, to have no branch on "is anything left" 1.1 to 1.2 (the branch lets the processor guess
-# the next node); u and v inside the walk 1.3; rays as (o, d) prepared inside the walk 1.05; boxes and leaves
-# in huge pages 1.0. The in-strip hierarchy split by SAH instead of halved lowers the expected cost by 3 %, a
-# new SAH hierarchy over the leaves by 10 %: neither is what the scene file holds. A new hierarchy over single
-# triangles ("rebuilt") is walked in 0.91 to 0.95 of the time.
+# test without lax.cond 1.09; four rays side by side 1.05 to 1.2, one 1.1; the node and its lanes always
+# read back from the stack, to have no branch on "is anything left" 1.1 to 1.2 (the branch lets the
+# processor guess the next node); u and v inside the walk 1.3; rays as (o, d) prepared inside the walk 1.05;
+# boxes and leaves in huge pages 1.0. The in-strip hierarchy split by SAH instead of halved lowers the
+# expected cost by 3 %, a new SAH hierarchy over the leaves by 10 %: neither is what the scene file holds. A
+# new hierarchy over single triangles ("rebuilt") is walked in 0.91 to 0.95 of the time.
 #
-# Of a dragon's camera rays 44 % meet no child of the root. They are dropped where rays are made ready, in 28
-# ns; as a walk of their own they took 70 to 90. A first form of that kernel with arrays of three in the place
-# of scalars took 43.
+# Of a dragon's camera rays 44 % meet no child of the root. They are dropped where rays are made ready, in
+# 28 ns; as a walk of their own they took 70 to 90. A first form of that kernel with arrays of three in the
+# place of scalars took 43.
 #
-# Tried on rebuilt hierarchies and lost, or no gain: a leaf cost of 0.6, 1.5 and 2.5 node costs 1.0; splits by
-# 32 bins and sweeps below 64 triangles 1.02 (camera) and 0.94 (occlusion), within the noise; occlusion rays
-# sorted by octant in runs of 1024 or 65536 1.08, by octant and longest axis 1.1; runs of 4096 1.0; tiles of
-# 2**14 to 2**18 rays 1.0.
+# Tried on rebuilt hierarchies and lost, or no gain: a leaf cost of 0.6, 1.5 and 2.5 node costs 1.0; splits
+# by 32 bins and sweeps below 64 triangles 1.02 (camera) and 0.94 (occlusion), within the noise; occlusion
+# rays sorted by octant in runs of 1024 or 65536 1.08, by octant and longest axis 1.1; runs of 4096 1.0;
+# tiles of 2**14 to 2**18 rays 1.0.
 #
 # Where the time of occlusion rays goes (rebuilt, dragon; sampled): nodes 45 %, leaves 40 %, of which half
-# waits for a leaf's first cache line. Leaf lines touched before the other ray's leaf is tested: 1.01 / 1.03 /
-# 1.015 (camera, occlusion closest, any hit), too little for what it looks like; touched in the node loop
+# waits for a leaf's first cache line. Leaf lines touched before the other ray's leaf is tested: 1.01 / 1.03
+# / 1.015 (camera, occlusion closest, any hit), too little for what it looks like; touched in the node loop
 # 0.96; the next node touched before the leaf 1.0. Rays that take the next one's place as soon as they end,
 # two to four in one loop over all rays: 0.87 to 0.99, though two by two a fifth of all steps is waiting.
 # Nodes visited until all rays are at leaves, in the place of until one is: 0.95 to 1.0 on a camera's rays,
@@ -163,13 +163,29 @@ class WideScene(NamedTuple):
 # since save 5 % of the nodes of occlusion rays, 13 % of a camera's one by one; children sorted by distance
 # 10 % and 20 %, and any hit then visits 4 % more.
 #
-# Any hit that visits what is far first: occlusion rays of scans meet 3 to 5 % fewer nodes and 7 to 10 % fewer
-# leaves (bunny, dragon), chords as many, and are traced 0.94 to 1.02 times as fast: what is near lies in the
-# cache. The longest way through a box first would save 3 % more of both.
+# Any hit that visits what is far first: occlusion rays of scans meet 3 to 5 % fewer nodes and 7 to 10 %
+# fewer leaves (bunny, dragon), chords as many, and are traced 0.94 to 1.02 times as fast: what is near lies
+# in the cache. The longest way through a box first would save 3 % more of both.
 #
 # Sifting leaves before hits are weighed (`walk.sifted`; rebuilt; bunny, dragon): occlusion closest 1.18,
-# 1.13, any hit 1.05, 1.02, a camera's rays one by one 1.0, 1.02. With the division left to the cond, but its
-# two numbers kept for it, 1.10; with edge functions alone 0.95; with the straddling of corners too 1.02. The
-# hit of a single lane told without a branch, by sums over lanes, 0.83 to 0.9. The next child found beside the
-# leaf's cond, not in it: 0.97. One array for a ray's place 0.93, for both rays' 0.91; all words of a ray and
-# its lane bits as integers 0.93. With one ray side by side now 0.83 to 1.0, with four 0.89.
+# 1.13, any hit 1.05, 1.02, a camera's rays one by one 1.0, 1.02. With the division left to the cond, but
+# its two numbers kept for it, 1.10; with edge functions alone 0.95; with the straddling of corners too
+# 1.02. The hit of a single lane told without a branch, by sums over lanes, 0.83 to 0.9. The next child
+# found beside the leaf's cond, not in it: 0.97. One array for a ray's place 0.93, for both rays' 0.91; all
+# words of a ray and its lane bits as integers 0.93. With one ray side by side now 0.83 to 1.0, with four
+# 0.89.
+#
+# Without branches (rebuilt; bunny, dragon, 3.5 M; Emerald Rapids): occlusion closest 1.10 to 1.15, any hit
+# 1.11 to 1.16, a camera's rays one by one 1.07 to 1.16 of what stood before. A turn of the node loop, two
+# rays, had 372 instructions, of which 136 were arithmetic and 84 loads and stores of pointers; it has 320.
+# The same ray again and again, which the processor guesses and finds in its caches, took 213 ns where its
+# neighbours took 350. What gave it, one after the other: values left in the loop 1.04, both rays' words in
+# one array 1.01, children taken without a branch 1.03, a bottom of the stack that is not looked for 1.02, a
+# shear that is asked for where it is used 1.02, the nearest t and its face found as one number of 64 bits
+# 1.01, and 1.05 for a camera.
+#
+# Lost on the way: one leaf test for whichever ray is there, chosen by its number, 0.93; both stacks in one
+# array 0.98; the child below taken ahead 0.95 (the stack is copied); a node written to the stack before it
+# is known whether it stays, twenty instructions fewer, 0.99; faces read in the cond of a hit 1.0. A choice
+# between a loaded number and another is made a branch by LLVM, unless something is done to the number in
+# between. Three rays side by side 0.95 to 1.05, four 0.95; registers of 512 bits 1.0.
