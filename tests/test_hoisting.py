@@ -114,9 +114,10 @@ def copied_in_loops(text, shape):
     return [line for line in copies if "/while" in line]
 
 
-@pytest.mark.parametrize("packets", [False, True])
-@pytest.mark.parametrize("any_hit", [False, True])
-@pytest.mark.parametrize("resident", ["expanded", "compressed"])
+@pytest.mark.parametrize(
+    ("resident", "any_hit", "packets"),
+    [("expanded", False, False), ("compressed", True, False), ("expanded", False, True)],
+)
 def test_stacks_are_not_copied_at_each_step(resident, any_hit, packets):
     """What is read of a stack leads to what is written next, or XLA writes to a copy of it."""
     tracer = Tracer(scene_under("reducem"), device="cpu", threads=1, resident=resident)

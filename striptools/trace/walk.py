@@ -472,7 +472,9 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
 
 def empty_stack(scene: Any, options: WalkOptions) -> Array:
     """The stack of a ray that has nothing left to visit: at its bottom is the last node, with no lanes."""
-    return jnp.zeros((options.stack_size, 2), jnp.int32).at[0, 0].set(scene.node_count - 1)
+    # A power of two, for the mask of `_entry`.
+    size = 1 << (options.stack_size - 1).bit_length()
+    return jnp.zeros((size, 2), jnp.int32).at[0, 0].set(scene.node_count - 1)
 
 
 def prepared_ray(scene: Any, origin: Array, direction: Array, t_max: Array, root: Array) -> Array:
@@ -555,7 +557,7 @@ def with_entry(stack: Array, height: Array, node: Array, lanes: Array) -> Array:
 
 
 def _entry(stack: Array, height: Array) -> Array:
-    """A place in a stack of 2**k entries: the mask tells the compiler that it is inside."""
+    """The place of an entry in a stack of 2**k: the mask tells the compiler that it is inside."""
     return index(height & (len(stack) - 1))
 
 
