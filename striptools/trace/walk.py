@@ -604,6 +604,21 @@ def step_down(
     return Place(child, lowered(height, left == 0)), node, lane, stack
 
 
+def leave_leaf(
+    scene: WalkScene, octant: Array, place: Place, stack: Array
+) -> tuple[Place, Array, Array, Array]:
+    """Go on from a leaf at the topmost entry of the stack; from anywhere else stay.
+
+    Not in a cond, where the stack would be copied. Returns what `step_down` does.
+    """
+    node, lanes = map(kept, entry_at(stack, place.height))
+    child, lane, left = take_child(scene, octant, node, lanes)
+    there = names_leaf(place.child)
+    stack = with_entry(stack, place.height, node, jnp.where(there, left, lanes))
+    height = lowered(place.height, there & (left == 0))
+    return Place(jnp.where(there, child, place.child), height), node, lane, stack
+
+
 def _visit_node(
     scene: WalkScene, ray: ReadyRay, place: Place, limit: Array, stack: Array
 ) -> tuple[Place, Array]:
@@ -789,8 +804,7 @@ class _Walk:
             for k in range(len(bests))
         )
         after = [
-            self.leave_leaf(*each)
-            for each in zip(self.rays, state.places, state.stacks, at_leaf, bests, strict=True)
+            self.leave_leaf(*each) for each in zip(self.rays, state.places, state.stacks, bests, strict=True)
         ]
         visits = self.count(state.visits, at_leaf, _A_LEAF)
         if visits:
@@ -812,15 +826,9 @@ class _Walk:
         """A ray that is at no leaf finds nothing."""
         return best
 
-    def leave_leaf(
-        self, ray: ReadyRay, place: Place, stack: Array, there: Array, best: Found
-    ) -> tuple[Place, Array]:
-        """A ray that is at a leaf takes the next child, not in a cond, where the stack would be copied."""
-        node, lanes = map(kept, entry_at(stack, place.height))
-        child, _, left = take_child(self.scene, ray.octant, node, lanes)
-        stack = with_entry(stack, place.height, node, jnp.where(there, left, lanes))
-        child = jnp.where(there, child, place.child)
-        height = lowered(place.height, there & (left == 0))
+    def leave_leaf(self, ray: ReadyRay, place: Place, stack: Array, best: Found) -> tuple[Place, Array]:
+        """A ray that is at a leaf takes the next child, one that has found what will do none."""
+        (child, height), _, _, stack = leave_leaf(self.scene, ray.octant, place, stack)
         if self.options.any_hit:
             found = best.nearest < ray.t_max
             child, height = jnp.where(found, DONE, child), jnp.where(found, 0, height)

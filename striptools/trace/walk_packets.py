@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, lax
 
 from striptools.kernels.packets import HEAD, PACKET
-from striptools.trace.numerics import ends_of, folded, in_range, index, kept, larger, smaller
+from striptools.trace.numerics import ends_of, folded, in_range, index, larger, smaller
 from striptools.trace.triangle import Shear, crossing_of, edges_of
 from striptools.trace.walk import (
     DONE,
@@ -44,14 +44,11 @@ from striptools.trace.walk import (
     WalkOptions,
     WalkScene,
     empty_stack,
-    entry_at,
     lane_bits_of,
-    lowered,
+    leave_leaf,
     names_leaf,
     sifted,
     step_down,
-    take_child,
-    with_entry,
 )
 
 FAR = np.float32(3.0e38)
@@ -380,13 +377,8 @@ def _walk_packet(
             lambda: found,
         )
 
-    def leave_leaf(state: _State, found: _Found) -> _State:
-        place = state.place
-        node, lanes = map(kept, entry_at(state.stack, place.height))
-        child, lane, left = take_child(scene, packet.octant, node, lanes)
-        there = names_leaf(place.child)
-        stack = with_entry(state.stack, place.height, node, jnp.where(there, left, lanes))
-        place = Place(jnp.where(there, child, place.child), lowered(place.height, there & (left == 0)))
+    def leave(state: _State, found: _Found) -> _State:
+        place, node, lane, stack = leave_leaf(scene, packet.octant, state.place, state.stack)
         done = found.limit < 0
         place = place._replace(child=jnp.where(done, DONE, place.child))
         return _State(place, node, lane, stack, state.turns)
@@ -399,7 +391,7 @@ def _walk_packet(
             state,
         )
         found = lax.cond(names_leaf(state.place.child), lambda: test_leaf(state, found), lambda: found)
-        return leave_leaf(state, found), found
+        return leave(state, found), found
 
     zero = jnp.int32(0)
     found = _Found(packet.rays[6], jnp.full(PACKET, MISS), _limit(packet, packet.rays[6]))
