@@ -33,6 +33,74 @@ def depth_of(words, records, top_count):
 
 
 @kernel
+def describe_slots(nodes, planes, top_count, first_run, runs, slots):
+    """Say of each slot of each node where its child is, so that a walk has neither to count nor to search.
+
+    Args:
+        nodes: (m, 16) uint32, SPEC 4.4.
+        planes: (m, 64) uint8, the same bytes.
+        top_count: How many nodes are over blocks.
+        first_run: (b,) uint32.
+        runs: (r,) uint32, SPEC 4.5.
+        slots: (m, 8) uint32, written. A node, or with bit 31 set a run: bits 0 to 7 are its first triangle;
+            8 to 15 the strip; 16 to 20 what bits 27 to 31 of the run are; 21 on the turns of its triangles
+            and a one behind the last. A slot that is empty is a run of no triangles.
+    """
+    for node in range(len(nodes)):
+        base = np.int64(nodes[node, 0]) & 0xFFFFFFF
+        block = np.int64(nodes[node, 1]) & 0xFFFFFF
+        run = np.int64(first_run[block]) + (np.int64(nodes[node, 1]) >> 24)
+        for slot in range(WIDTH):
+            said = np.int64(1) << 31 | 1 << 21
+            if (planes[node, 14] >> slot) & 1:
+                said = base
+                base += 1
+            elif planes[node, LOW + slot] <= planes[node, LOW + 3 * WIDTH + slot]:
+                if node < top_count:
+                    said = top_count + block
+                    block += 1
+                else:
+                    of_run = np.int64(runs[run])
+                    turns = of_run >> 19 & 0xFF | 2 << (of_run >> 8 & 7)
+                    said = 1 << 31 | turns << 21 | (of_run >> 27) << 16 | (of_run >> 11 & 0xFF) << 8 | of_run & 0xFF
+                    run += 1
+            slots[node, slot] = said
+
+
+@kernel
+def describe_blocks(headers, scale_exponent, blocks):
+    """Say of each block what a walk decodes it by.
+
+    Args:
+        headers: (b, 8) uint32, SPEC 4.2.
+        scale_exponent: Of the power of two that positions are multiplied by.
+        blocks: (b, 16) uint32, written: the first triangle; the first word; bits 0 to 7 of the third word the
+            triangles, less one, 8 to 11 the width of an index, 12 whether there are flips, from 13 on the
+            bit where vertices begin; bits 0 to 6 of the fourth the bits of a vertex, from 7 on the bit where
+            indices begin. Then four words for each axis: the anchor, a mask as wide as its numbers, the power
+            of two that they are multiplied by, and in bits 0 to 6 of the last word where they begin in a
+            vertex, 7 and 8 the mode, from 9 on the exponent of that power, plus 512.
+    """
+    for block in range(len(headers)):
+        connectivity, size = block_bits(headers, block)
+        triangles, vertices, _, flips, width = block_counts(headers, block)
+        blocks[block, 12] = headers[block, 0]
+        blocks[block, 13] = headers[block, 1]
+        blocks[block, 14] = triangles - 1 | width << 8 | flips << 12 | connectivity << 13
+        blocks[block, 15] = size // vertices | (2 + flips) * triangles << 7
+        begin = np.int64(0)
+        for axis in range(3):
+            mode, bits, anchor, exponent = axis_of(headers, block, axis)
+            exponent = scale_exponent if mode == 2 else exponent + scale_exponent
+            at = 4 * axis
+            blocks[block, at] = headers[block, 3 + axis]
+            blocks[block, at + 1] = (np.int64(1) << bits) - 1
+            blocks[block, at + 2] = (min(max(exponent, -126), 127) + 127) << 23
+            blocks[block, at + 3] = begin | mode << 7 | (exponent + 512) << 9
+            begin += bits
+
+
+@kernel
 def least_exponent(headers, words):
     """The exponent of the least power of two that is in a coordinate of mode 2; 0 where all are larger."""
     least = np.int64(0)

@@ -40,6 +40,9 @@ class PackedLayout:
     """
 
     arrays: PackedScene
+    headers: np.ndarray
+    top_count: int
+    scale_exponent: int
     blocks: int
     rotations: np.ndarray
     decode: Decode
@@ -48,7 +51,7 @@ class PackedLayout:
     @property
     def triangles(self) -> int:
         """How many there are."""
-        last = self.arrays.headers[self.blocks - 1]
+        last = self.headers[self.blocks - 1]
         return int(last[0]) + int(last[2] & 0xFF) + 1
 
     @property
@@ -64,7 +67,7 @@ class PackedLayout:
         leaf = ~inner & ~empty
         rank = np.cumsum(leaf) - 1
         child = np.where(inner, (word[0] & 0xFFFFFFF) + np.cumsum(inner) - 1, -1 - np.arange(WIDTH))
-        top = int(self.arrays.top_count)
+        top = self.top_count
         if top:
             child = np.where(leaf, top + (word[1] & 0xFFFFFF) + rank, child)
         return np.where(empty, np.float32(np.nan), boxes), child.astype(np.int32)
@@ -87,7 +90,7 @@ class PackedLayout:
     def nbytes(self) -> int:
         """Bytes of all arrays; planes are the nodes' memory."""
         arrays = self.arrays
-        held = (arrays.nodes, arrays.headers, arrays.words, arrays.first_run, arrays.runs, arrays.faces)
+        held = (arrays.nodes, self.headers, arrays.words, arrays.slots, arrays.blocks, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
 
     @property
@@ -99,20 +102,20 @@ class PackedLayout:
         """See `layout.Layout`."""
         arrays = self.arrays
         corners, turns = np.zeros((len(names), 3, 3), np.float32), np.zeros(len(names), np.int32)
-        given = (names, arrays.headers[: self.blocks], arrays.words, self.rotations)
-        packed_corners(*given, int(arrays.scale_exponent), corners, turns)
+        given = (names, self.headers[: self.blocks], arrays.words, self.rotations)
+        packed_corners(*given, self.scale_exponent, corners, turns)
         return corners, turns
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of the file's are turned."""
-        triangles = (self.arrays.headers[names >> 8, 0] + (names & 0xFF)).astype(np.int32)
+        triangles = (self.headers[names >> 8, 0] + (names & 0xFF)).astype(np.int32)
         faces = self.arrays.faces[triangles] if self.arrays.has_faces else triangles
         turns = self.rotations[triangles] if len(self.rotations) else np.zeros(len(names), np.uint8)
         return faces, triangles, turns
 
     def names(self) -> np.ndarray:
         """See `layout.Layout`: 256 times the block and the number there."""
-        headers = self.arrays.headers[: self.blocks]
+        headers = self.headers[: self.blocks]
         first, count = headers[:, 0].astype(np.int64), (headers[:, 2] & 0xFF).astype(np.int64) + 1
         block = np.repeat(np.arange(self.blocks), count)
         return (block << 8 | (np.arange(len(block)) - first[block])).astype(np.int32)
@@ -126,14 +129,14 @@ class PackedLayout:
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
-        headers = arrays.headers[: self.blocks]
+        headers = self.headers[: self.blocks]
         kept = (
             headers,
             arrays.words,
             arrays.faces,
             self.rotations,
             arrays.frame.scale,
-            int(arrays.scale_exponent),
+            self.scale_exponent,
         )
         kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], *kept, *found)
 
@@ -161,20 +164,22 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     exponent = int(np.frexp(scale)[1]) - 1
     faces, rotations = _names(scene, laid)
     nodes = laid(packed.nodes)
+    slots = aligned_zeros((len(nodes), WIDTH), np.uint32)
+    given = packed.nodes, packed.nodes.view(np.uint8), packed.top_count, packed.first_run, packed.runs
+    kernels.describe_slots(*given, slots)
+    described = aligned_zeros((size_class(len(blocks.headers), STEPS), 16), np.uint32)
+    kernels.describe_blocks(blocks.headers, exponent, described)
     arrays = PackedScene(
         nodes,
         nodes.view(np.uint8),
-        laid(blocks.headers),
+        slots,
+        described,
         laid(blocks.words),
-        laid(packed.first_run),
-        laid(packed.runs),
         faces,
-        np.uint32(packed.top_count),
-        np.int32(exponent),
         _frame(scene, scale, exponent),
     )
     depth = int(kernels.depth_of(packed.nodes, packed.nodes.view(np.uint8), packed.top_count))
-    return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks, exponent), depth)
+    return PackedLayout(arrays, blocks.headers, packed.top_count, exponent, blocks.count, rotations, decode_of(blocks, exponent), depth)
 
 
 def decode_of(blocks: "Blocks", scale_exponent: int) -> Decode:

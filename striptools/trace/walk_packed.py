@@ -75,25 +75,19 @@ class PackedScene(NamedTuple):
     Attributes:
         nodes: (m, 16) uint32, SPEC 4.4.
         planes: (m, 64) uint8, the same bytes: on a CPU the same memory, on a GPU an array of its own.
-        headers: (b, 8) uint32, SPEC 4.2.
+        slots: (m, 8) uint32, of each node's children, as `kernels.packed_hits.describe_slots` writes them.
+        blocks: (b, 16) uint32, as `kernels.packed_hits.describe_blocks` writes them.
         words: (w,) uint32, the streams, and zeros behind them that a load may touch.
-        first_run: (b,) uint32.
-        runs: (r,) uint32, SPEC 4.5.
         faces: (n,) int32, the reported face of each triangle in file order; (0,) where they are their own.
-        top_count: () uint32, nodes over blocks.
-        scale_exponent: () int32, of the frame's scale.
         frame: How rays are seen: boxes are counted from the grid's low, in its cells.
     """
 
     nodes: Any
     planes: Any
-    headers: Any
+    slots: Any
+    blocks: Any
     words: Any
-    first_run: Any
-    runs: Any
     faces: Any
-    top_count: Any
-    scale_exponent: Any
     frame: Frame
 
     @property
@@ -173,61 +167,50 @@ class PackedScene(NamedTuple):
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
-        head = self._row(self.nodes, index(node), 0, 4)
-        bit = np.uint32(1) << (lane & 7)
-        inner, leaves = head[3] >> 16 & 0xFF, head[1] >> 24
-        below = bit - 1
-        as_node = (head[0] & 0xFFFFFFF) + self._ones(inner & below)
-        as_block = self.top_count + (head[1] & BLOCK_BITS) + self._ones(leaves & below)
-        as_run = ~(index(node) << 3 | (lane & 7))
-        child = jnp.where(index(node) < self.top_count, as_block, as_run)
-        child = jnp.where((inner & bit) != 0, as_node, child).astype(jnp.int32)
+        said = self._row(self.slots, index(node), lane & 7, 1)[0].astype(jnp.int32)
+        child = jnp.where(said < 0, (~(index(node) << 3 | (lane & 7))).astype(jnp.int32), said)
         # The bottom of a stack has a lane that no node has.
         return jnp.where(lane > 7, DONE, child)
 
     def find_leaf(self, child: Array) -> "_Run":
         """The run of a leaf; some run where the child is none."""
-        return self._run_of(jnp.where((child < 0) & (child != DONE), child, -1))
+        code = index(~child)
+        node = code >> 3
+        block = self._row(self.nodes, node, 1, 1)[0] & BLOCK_BITS
+        return _Run(block, self._row(self.slots, node, code & 7, 1)[0])
 
     def leaf_of(self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None) -> Leaf:
         """The triangles of a run, decoded, their corners along these axes."""
         assert decode is not None
-        # Behind a barrier, or XLA reads it anew for every use of it.
-        header = self._settled(self._row(self.headers, where.block, 0, 8))
-        x, y, z = self._decoded(header, where, _axes(header, self.scale_exponent), decode)
-        ax, ay, az = (_along(x, y, z, axis) for axis in axes)
-        return Leaf(ax, ay, az, first_corner(x, y, z), *self._named(where))
+        x, y, z = self._decoded(where, axes, decode)
+        turn = _first_corner_along(x, y, z, axes)
+        return Leaf(tuple(x), tuple(y), tuple(z), turn, *self._named(where))
 
     def leaf_for_packets(
         self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None
     ) -> Callable[[], Leaf]:
-        """The same, decoded once: behind a cond, or XLA decodes it anew for every use.
-
-        What an axis needs is chosen, not what it gives: a few numbers in the place of lanes.
-        """
+        """The same, decoded once: behind a cond, or XLA decodes it anew for every use."""
         assert decode is not None
         nothing = ([jnp.zeros(LANES)] * 3,) * 3
-
-        def decoded() -> tuple[list[Array], ...]:
-            header = self._settled(self._once(self.headers, where.block))
-            x, y, z = self._decoded(header, where, axes_along(header, self.scale_exponent, axes), decode)
-            return x, y, z
-
         # Always so, which XLA does not know.
-        x, y, z = lax.cond(where.block <= BLOCK_BITS, decoded, lambda: nothing)
+        x, y, z = lax.cond(
+            where.block <= BLOCK_BITS, lambda: self._decoded(where, axes, decode), lambda: nothing
+        )
         turn = _first_corner_along(x, y, z, axes)
         return lambda: Leaf(tuple(x), tuple(y), tuple(z), turn, *self._named(where))
 
     def _named(self, where: "_Run") -> tuple[Array, Array]:
         """Which lanes hold a triangle of a run, and their names."""
         lane = self._lanes()
-        name = (where.block << 8 | ((where.said & 0xFF) + lane)).astype(jnp.int32)
-        return lane <= (where.said >> 8 & 7), name
+        return where.turns >> lane > 1, (where.block << 8 | (where.first + lane)).astype(jnp.int32)
 
-    def _decoded(self, header: Any, where: "_Run", axes: list["_Axis"], decode: Decode) -> list[list[Array]]:
+    def _decoded(
+        self, where: "_Run", axes: tuple[Array, Array, Array], decode: Decode
+    ) -> tuple[list[Array], ...]:
         """Coordinates along axes of the corners a, b, c of a run's triangles, scaled."""
-        corners = self._corners(header, where.said, decode.flips)
-        return self._positions(header, corners, axes, decode)
+        block = _Block(*self._settled(self._row(self.blocks, where.block, 12, 4)))
+        along = [_Axis(*self._settled(self._row(self.blocks, where.block, axis * 4 & 12, 4))) for axis in axes]
+        return self._positions(block, self._corners(block, where, decode.flips), along, decode)
 
     def visit_leaf(self, ray: Sighted, where: "_Run", best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, against the closest hit so far."""
@@ -241,7 +224,7 @@ class PackedScene(NamedTuple):
 
     def triangles_of(self, where: "_Run") -> Array:
         """() int32: how many triangles a run has."""
-        return ((where.said >> 8 & 7) + 1).astype(jnp.int32)
+        return (31 - _leading_zeros(where.turns)).astype(jnp.int32)
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
         """A node is eight boxes and 64 bytes; a leaf a run, a header, indices and vertices: see the notes."""
@@ -255,7 +238,7 @@ class PackedScene(NamedTuple):
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""
         block, place = index(names) >> 8, index(names) & 0xFF
-        triangle = self._at(self.headers, (block, np.uint32(0))) + place
+        triangle = self._at(self.blocks, (block, np.uint32(12))) + place
         face = self._at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
         return jnp.where(names < 0, names, face)
 
@@ -275,9 +258,9 @@ class PackedScene(NamedTuple):
         """Values at places, or at rows and columns, that are known to be inside."""
         return values.at[places].get(mode="promise_in_bounds")
 
-    def _row(self, rows: Array, row: Array, first: int, count: int) -> Any:
+    def _row(self, rows: Array, row: Array, first: Any, count: int) -> Any:
         """Some values of a row, one after the other."""
-        return lax.dynamic_slice(rows, (row, jnp.uint32(first)), (1, count))[0]
+        return lax.dynamic_slice(rows, (row, jnp.asarray(first, jnp.uint32)), (1, count))[0]
 
     def _planes_of(self, node: Array) -> Any:
         """(6, 8) int32: the lanes' planes on each axis, low and high."""
@@ -293,19 +276,6 @@ class PackedScene(NamedTuple):
         rows = lax.gather(self.words, places[:, None], dimensions, slice_sizes=(count,), mode=inside)
         return [rows[k] for k in range(count)]
 
-    def _once(self, values: Array, place: Array) -> Any:
-        """The value at a place, or the row, found once: of a pair of places XLA keeps what it gathers.
-
-        What leads to a slice it computes again for each use.
-        """
-        dimensions = lax.GatherDimensionNumbers(
-            offset_dims=tuple(range(1, values.ndim)), collapsed_slice_dims=(0,), start_index_map=(0,)
-        )
-        # Signed: XLA's CPU backend gathers wrongly by unsigned places where it does not fuse.
-        places = jnp.stack([place, place])[:, None].astype(jnp.int32)
-        inside = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-        return lax.gather(values, places, dimensions, slice_sizes=(1, *values.shape[1:]), mode=inside)[0]
-
     def _settled(self, values: Any) -> Any:
         """Values that are not computed again for each use."""
         return lax.optimization_barrier(values)
@@ -314,44 +284,23 @@ class PackedScene(NamedTuple):
         """How many bits are set."""
         return lax.population_count(values)
 
-    def _run_of(self, child: Array) -> "_Run":
-        """The block of a leaf, and what is said of its run."""
-        code = index(~child)
-        node, slot = code >> 3, code & 7
-        head, low_x, high_x = (
-            self._row(self.nodes, node, at, size) for at, size in ((0, 4), (4, 2), (10, 2))
-        )
-        inner, below = head[3] >> 16 & 0xFF, (np.uint32(1) << slot) - 1
-        bits = 8 * (slot & 3)
-        under = (np.uint32(1) << bits) - 1
-        first = used_bytes(low_x[0], high_x[0]) & jnp.where(slot < 4, under, ALL)
-        second = used_bytes(low_x[1], high_x[1]) & jnp.where(slot < 4, 0, under)
-        rank = self._ones(first | second >> 1) - self._ones(inner & below)
-        block = head[1] & BLOCK_BITS
-        said = self._once(self.runs, self._at(self.first_run, block) + (head[1] >> 24) + rank)
-        return _Run(block, said)
-
-    def _corners(self, header: Array, run: Array, flips: bool) -> tuple[Array, Array, Array]:
+    def _corners(self, block: "_Block", run: "_Run", flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""
-        word, counts = header[1], header[2]
-        triangles, has_flips = (counts & 0xFF) + 1, counts >> 24 & 1
         lane = self._lanes()
-        first, place = run & 0xFF, first_place(run)
 
         # The far corner is what the last other turn left behind.
-        turns = run >> 19 & 0xFF
-        turned = (turns >> lane & 1) != 0
-        other = jnp.where(turned, ~turns, turns) & ((np.uint32(2) << lane) - 1)
+        turned = (run.turns >> lane & 1) != 0
+        other = jnp.where(turned, ~run.turns, run.turns) & ((np.uint32(2) << lane) - 1)
         last = 31 - _leading_zeros(other)
 
-        indices, width = index_stream(header)
+        indices, width, place = block.indices, block.index_width, run.place
         mask = (np.uint32(1) << width) - 1
-        near = self._windows(word, indices + place * width, width * lane)
-        far = self._windows(word, indices + place * width, width * jnp.where(other == 0, 0, last))
-        before = self._windows(word, indices + (place - (run >> 27)) * width, np.uint32(0), 2)
+        near = self._windows(block.word, indices + place * width, width * lane)
+        far = self._windows(block.word, indices + place * width, width * jnp.where(other == 0, 0, last))
+        before = self._windows(block.word, indices + (place - run.back) * width, np.uint32(0), 2)
         far = jnp.where(other == 0, before, far) & mask
         if flips:
-            flipped = self._windows(word, 2 * triangles + first, lane, 3) & has_flips
+            flipped = self._windows(block.word, 2 * block.triangles + run.first, lane, 3) & block.has_flips
             turned = turned ^ (flipped != 0)
         newest, near = near >> width & mask, near & mask
         return jnp.where(turned, far, near), jnp.where(turned, near, far), newest
@@ -371,21 +320,17 @@ class PackedScene(NamedTuple):
         return lower >> shift | upper << 1 << (31 - shift)
 
     def _positions(
-        self, header: Any, corners: tuple[Array, ...], axes: list["_Axis"], decode: Decode
-    ) -> list[list[Array]]:
+        self, block: "_Block", corners: tuple[Array, ...], axes: list["_Axis"], decode: Decode
+    ) -> tuple[list[Array], ...]:
         """Scaled coordinates of the corners along axes, (8,) float32 each."""
-        counts = header[2]
-        indices, index_width = index_stream(header)
-        vertices = indices + ((counts & 0xFF) + 2 * (counts >> 16 & 0xFF) + 3) * index_width
-        stride = axes[0].width + axes[1].width + axes[2].width
         found = []
         for corner in corners:
-            bit = vertices + corner * stride
+            bit = block.vertices + corner * block.stride
             shift = bit & 31
-            loaded = [*self._words_at(header[1] + (bit >> 5), decode.words), jnp.zeros_like(bit)]
+            loaded = [*self._words_at(block.word + (bit >> 5), decode.words), jnp.zeros_like(bit)]
             vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
-        return [[vertex[axis] for vertex in found] for axis in range(3)]
+        return tuple([vertex[axis] for vertex in found] for axis in range(3))
 
 
 class _Run(NamedTuple):
@@ -393,53 +338,99 @@ class _Run(NamedTuple):
 
     Attributes:
         block: The block.
-        said: What `kernels.packed_hits.describe_runs` says of the run.
+        said: What `kernels.packed_hits.describe_slots` says of the run.
     """
 
     block: Array
     said: Array
 
+    @property
+    def first(self) -> Array:
+        """The first triangle."""
+        return self.said & 0xFF
+
+    @property
+    def place(self) -> Array:
+        """Of its near corner among the block's indices."""
+        return self.first + 2 * (self.said >> 8 & 0xFF) + 1
+
+    @property
+    def back(self) -> Array:
+        """How far before that its far corner is."""
+        return self.said >> 16 & 31
+
+    @property
+    def turns(self) -> Array:
+        """Bits: of each triangle its turn, and a one behind the last."""
+        return self.said >> 21 & 0x1FF
+
+
+class _Block(NamedTuple):
+    """What `kernels.packed_hits.describe_blocks` says of a block: () uint32 each."""
+
+    first_triangle: Array
+    word: Array
+    counts: Array
+    places: Array
+
+    @property
+    def triangles(self) -> Array:
+        """How many."""
+        return (self.counts & 0xFF) + 1
+
+    @property
+    def index_width(self) -> Array:
+        """Bits of an index."""
+        return self.counts >> 8 & 15
+
+    @property
+    def has_flips(self) -> Array:
+        """One or zero."""
+        return self.counts >> 12 & 1
+
+    @property
+    def vertices(self) -> Array:
+        """The bit where they begin."""
+        return self.counts >> 13
+
+    @property
+    def stride(self) -> Array:
+        """Bits of a vertex."""
+        return self.places & 127
+
+    @property
+    def indices(self) -> Array:
+        """The bit where they begin."""
+        return self.places >> 7
+
 
 class _Axis(NamedTuple):
-    """How a block's coordinates on an axis are written: () each."""
+    """How a block's coordinates on an axis are written: () uint32 each."""
 
-    offset: Any
-    width: Array
-    mode: Array
     anchor: Array
-    exponent: Array
-    scale_exponent: Array
+    mask: Array
+    power: Array
+    rest: Array
 
+    @property
+    def offset(self) -> Array:
+        """The first bit in a vertex."""
+        return self.rest & 127
 
-def first_place(said: Array) -> Array:
-    """Of a run described: the place of its first triangle's near corner among a block's indices."""
-    return (said & 0xFF) + 2 * (said >> 11 & 0xFF) + 1
+    @property
+    def mode(self) -> Array:
+        """0 to 2."""
+        return self.rest >> 7 & 3
 
+    @property
+    def exponent(self) -> Array:
+        """Of the scaled coordinates, or of the scale in mode 2: int32."""
+        return (self.rest >> 9).astype(jnp.int32) - 512
 
-def index_stream(header: Any) -> tuple[Array, Array]:
-    """Where among a block's bits the indices of its vertices begin, and the bits of one."""
-    counts = header[2]
-    return (2 + (counts >> 24 & 1)) * ((counts & 0xFF) + 1), 32 - _leading_zeros(counts >> 8 & 0xFF)
-
-
-def axes_along(header: Any, scale_exponent: Array, axes: tuple[Array, Array, Array]) -> list[_Axis]:
-    """The axes of a block in another order, as of a shear."""
-    described = _axes(header, scale_exponent)
-    return [_Axis(*(pick(a, axis) for a in zip(*described, strict=True))) for axis in axes]
-
-
-def _axes(header: Any, scale_exponent: Array) -> list[_Axis]:
-    """The three axes of a block; the exponent is that of the scaled coordinates."""
-    described = header[6], header[6] >> 8, header[6] >> 16
-    exponents = header[6] >> 24, header[7] & 0xFF, header[7] >> 8 & 0xFF
-    axes = []
-    offset = np.uint32(0)
-    for axis in range(3):
-        width, mode = described[axis] & 63, described[axis] >> 6 & 3
-        exponent = exponents[axis].astype(jnp.int32) - 149 + scale_exponent
-        axes.append(_Axis(offset, width, mode, header[3 + axis], exponent, scale_exponent))
-        offset = offset + width
-    return axes
+    @property
+    def unit(self) -> Array:
+        """Two to its power, where that is normal."""
+        return lax.bitcast_convert_type(self.power, jnp.float32)
 
 
 def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
@@ -449,21 +440,18 @@ def _coordinate(vertex: list[Array], axis: _Axis, decode: Decode) -> Array:
     lower, upper = padded[0], padded[1]
     for k in range(1, min(3, len(vertex))):
         lower, upper = jnp.where(place == k, padded[k], lower), jnp.where(place == k, padded[k + 1], upper)
-    mask = jnp.where(axis.width == 0, np.uint32(0), ALL >> (32 - axis.width & 31))
-    number = (lower >> shift | upper << 1 << (31 - shift)) & mask
+    number = (lower >> shift | upper << 1 << (31 - shift)) & axis.mask
     whole = (axis.anchor + number).astype(jnp.int32)
     value = whole.astype(jnp.float32)
     if decode.minus_zero:
-        value = jnp.where((axis.mode == 1) & (number == mask), np.float32(0), value)
+        value = jnp.where((axis.mode == 1) & (number == axis.mask), np.float32(0), value)
     if decode.tiny:
         value = _scaled(value, axis.exponent)
-        return jnp.where(axis.mode == 2, _from_bits(whole, axis.scale_exponent), value)
-    exponent = axis.exponent
+        return jnp.where(axis.mode == 2, _from_bits(whole, axis.exponent), value)
     if decode.as_bits:
         bits = whole ^ (whole >> 31 & 0x7FFFFFFF)
         value = jnp.where(axis.mode == 2, lax.bitcast_convert_type(bits, jnp.float32), value)
-        exponent = jnp.where(axis.mode == 2, axis.scale_exponent, exponent)
-    return value * power_of_two(exponent)
+    return value * axis.unit
 
 
 def _from_bits(whole: Array, scale_exponent: Array) -> Array:
@@ -481,12 +469,6 @@ def _scaled(number: Array, exponent: Array) -> Array:
     first = jnp.clip(exponent, -126, 127)
     value = number * power_of_two(first) * power_of_two(jnp.clip(exponent - first, -126, 127))
     return jnp.where(jnp.abs(value) < np.finfo(np.float32).tiny, np.float32(0), value)
-
-
-def _along(x: list[Array], y: list[Array], z: list[Array], axis: Array) -> Corners:
-    """The coordinates along an axis of corners a, b, c."""
-    a, b, c = (pick(corner, axis) for corner in zip(x, y, z, strict=True))
-    return a, b, c
 
 
 def first_corner(x: list[Array], y: list[Array], z: list[Array]) -> Array:
