@@ -640,18 +640,17 @@ def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array]
         name: (8,) int32.
         faces_of: Where names are not faces, the faces of (8,) names.
     """
-    hit = (t > 0) & (t <= best.nearest)
+    # Nothing found so far may be infinitely far, as are some misses.
+    hit = (t > 0) & (t <= smaller(best.nearest, HIGHEST))
+    found = _least(best, t, name, hit)
     if faces_of is None:
-        return _least(best, t, name, hit)
-
-    def replace() -> Best:
-        nearest = folded(jnp.where(hit, t, np.float32(jnp.inf)), smaller)
-        names = jnp.where(t == nearest, name, NO_NAME)
-        least = folded(names, smaller)
-        least, new = _first_by_face(faces_of, names, least, nearest, best)
-        return Best(nearest, jnp.where(new, least, best.name))
-
-    return lax.cond(any_lane(hit), replace, lambda: best)
+        return found
+    tied = hit & (t == found.nearest)
+    several = jnp.sum(jnp.where(tied, np.int32(1), np.int32(0))) > jnp.where(
+        found.nearest < best.nearest, np.int32(1), np.int32(0)
+    )
+    first = partial(_first_by_face, faces_of, best, found, tied, name)
+    return found._replace(name=lax.cond(several, first, lambda: found.name))
 
 
 def _least(best: Best, t: Array, name: Array, hit: Array) -> Best:
@@ -670,22 +669,14 @@ def _least(best: Best, t: Array, name: Array, hit: Array) -> Best:
 
 
 def _first_by_face(
-    faces_of: Callable[[Array], Array], names: Array, least: Array, nearest: Array, best: Best
-) -> tuple[Array, Array]:
-    """Of names the one of the least face, and whether it takes the place of what was found before.
-
-    Faces are read only where there are two hits at the same t.
-    """
-
-    def by_face() -> tuple[Array, Array]:
-        faces = jnp.where(names == NO_NAME, NO_NAME, faces_of(jnp.where(names == NO_NAME, 0, names)))
-        face = folded(faces, smaller)
-        first = folded(jnp.where(faces == face, names, NO_NAME), smaller)
-        before = faces_of(jnp.full(WIDTH, best.name))[0]
-        return first, (nearest < best.nearest) | (face < before)
-
-    several = folded(jnp.where(names == NO_NAME, jnp.int32(0), jnp.int32(1)), jnp.add) > 1
-    return lax.cond(several | (nearest == best.nearest), by_face, lambda: (least, jnp.bool_(True)))
+    faces_of: Callable[[Array], Array], best: Best, found: Best, tied: Array, name: Array
+) -> Array:
+    """Of hits at the same t, `tied` ones and maybe the best so far, the name of that of the least face."""
+    faces = jnp.where(tied, faces_of(jnp.where(tied, name, 0)), NO_NAME)
+    face = folded(faces, smaller)
+    first = folded(jnp.where(faces == face, name, NO_NAME), smaller)
+    before = faces_of(jnp.full(WIDTH, best.name))[0]
+    return jnp.where((found.nearest < best.nearest) | (face < before), first, best.name)
 
 
 def found_in(

@@ -317,16 +317,15 @@ def _one_triangle(
     turn = None if leaf.turn is None else of_triangle(leaf.turn)
     crossing = crossing_of(edges_of(x, y, z, packet.shear), turn)
     mine = of_triangle(leaf.name)
-    tied = (crossing > 0) & (crossing == t)
+    first = jnp.where(mine < name, np.int32(1), np.int32(0))
     if scene.has_faces:
+        # Numbers, as flags go through memory one by one.
+        def by_face() -> Array:
+            return jnp.where(scene.faces_of(mine[None])[0] < scene.faces_of(name), np.int32(1), np.int32(0))
 
-        def first() -> Array:
-            return tied & (scene.faces_of(mine[None])[0] < scene.faces_of(name))
-
-        tied = lax.cond(_bits(tied) != 0, first, lambda: tied)
-    else:
-        tied = tied & (mine < name)
-    closer = (crossing > 0) & (crossing < t) | tied
+        tied = _bits((crossing - t == 0) & (crossing + t > 0) & (name >= 0)) != 0
+        first = lax.cond(tied, by_face, lambda: jnp.zeros_like(name))
+    closer = (crossing > 0) & ((crossing < t) | (crossing == t) & (first != 0))
     return jnp.where(closer, crossing, t), jnp.where(closer, mine, name)
 
 
