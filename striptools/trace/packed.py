@@ -57,7 +57,7 @@ class PackedLayout:
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
         """(6, 8) float32 boxes of the root's children in cells, NaN where there is none, and children."""
-        word, record = self.arrays.nodes[0].astype(np.int64), self.arrays.planes[0]
+        word, record = self.arrays.nodes[0].astype(np.int64), self.arrays.planes[0].reshape(64)
         origin = np.array([word[2] & 0xFFFF, word[2] >> 16, word[3] & 0xFFFF])
         shift = np.array([word[0] >> 28, word[3] >> 24 & 15, word[3] >> 28])
         planes = record[16:].reshape(2, 3, WIDTH).astype(np.int64)
@@ -171,7 +171,7 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     kernels.describe_blocks(blocks.headers, exponent, described)
     arrays = PackedScene(
         nodes,
-        nodes.view(np.uint8),
+        nodes.view(np.uint8).reshape(len(nodes), WIDTH, WIDTH),
         slots,
         described,
         laid(blocks.words),

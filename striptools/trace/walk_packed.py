@@ -74,7 +74,7 @@ class PackedScene(NamedTuple):
 
     Attributes:
         nodes: (m, 16) uint32, SPEC 4.4.
-        planes: (m, 64) uint8, the same bytes: on a CPU the same memory, on a GPU an array of its own.
+        planes: (m, 8, 8) uint8, the same bytes: on a CPU the same memory, on a GPU an array of its own.
         slots: (m, 8) uint32, of each node's children, as `kernels.packed_hits.describe_slots` writes them.
         blocks: (b, 16) uint32, as `kernels.packed_hits.describe_blocks` writes them.
         words: (w,) uint32, the streams, and zeros behind them that a load may touch.
@@ -122,7 +122,7 @@ class PackedScene(NamedTuple):
     def boxes_of(self, node: Array) -> Array:
         """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
         at = index(node)
-        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(2), jnp.uint32(0)), (1, 6, LANES))[0]
         head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
         origins = jnp.stack([head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF])
         shifts = jnp.stack([head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28])
@@ -142,23 +142,20 @@ class PackedScene(NamedTuple):
         return self._sides(node, rows, [self._planes(node, row, lane, 1)[0] for row in rows])
 
     def _planes(self, node: Array, row: Array, lane: Array, count: int) -> Array:
-        at = (index(node), jnp.uint32(16) + LANES * row + lane)
-        return lax.dynamic_slice(self.planes, at, (1, count))[0].astype(jnp.int32)
+        # Masks say what is known to be inside.
+        at = (index(node), (row + 2) & 7, lane & 7)
+        return lax.dynamic_slice(self.planes, at, (1, 1, count))[0, 0].astype(jnp.int32)
 
     def _sides(self, node: Array, rows: tuple[Array, ...], planes: list[Array]) -> list[Array]:
         """Where planes in rows lie, two of an axis at a time, scaled."""
+        origins, shifts = self._grid(self._row(self.nodes, index(node), 0, 4))
         sides = []
         for k in range(0, len(rows), 2):
             axis = jnp.where(rows[k] >= 3, rows[k] - 3, rows[k])
-            # Bytes of the record: an origin has two, shifts are four bits of the fourth and the last.
-            below, above, shift = (
-                lax.dynamic_slice(self.planes, (index(node), at), (1, 1))[0, 0].astype(jnp.int32)
-                for at in (8 + 2 * axis, 9 + 2 * axis, jnp.where(axis == 0, jnp.uint32(3), jnp.uint32(15)))
-            )
-            origin, shift = below | above << 8, jnp.where(axis == 1, shift & 15, shift >> 4)
             unit, low = (lax.dynamic_slice(a, (axis,), (1,))[0] for a in (self.frame.unit, self.frame.low))
             for each in planes[k : k + 2]:
-                sides.append((origin + (each << shift)).astype(jnp.float32) * unit + low)
+                cells = pick(tuple(origins), axis) + (each << pick(tuple(shifts), axis))
+                sides.append(cells.astype(jnp.float32) * unit + low)
         return sides
 
     def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
@@ -264,7 +261,7 @@ class PackedScene(NamedTuple):
 
     def _planes_of(self, node: Array) -> Any:
         """(6, 8) int32: the lanes' planes on each axis, low and high."""
-        planes = lax.dynamic_slice(self.planes, (node, jnp.uint32(16)), (1, 48))[0].reshape(6, LANES)
+        planes = lax.dynamic_slice(self.planes, (node, jnp.uint32(2), jnp.uint32(0)), (1, 6, LANES))[0]
         return planes.astype(jnp.int32)
 
     def _words_at(self, places: Array, count: int) -> list[Array]:
