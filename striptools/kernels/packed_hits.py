@@ -9,32 +9,43 @@ from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
 from striptools.kernels.wide import LEAST_NORMAL, WIDTH, precedes
 
+INNER = 14
+"""The byte of a node that says which slots hold nodes."""
+
+SLOT_IS_LEAF = 1 << 31
+"""Set in what is said of a slot that holds a leaf, or nothing."""
+
+BLOCK_WORDS = 16
+"""Words that are said of a block."""
+
+HEAD = 12
+"""Where among them those begin that are of no axis."""
+
+BIAS = 512
+"""What is added to an exponent."""
+
 
 @kernel
-def depth_of(words, records, top_count):
-    """The most nodes on a way from the root down; children come after their parents."""
-    count = len(words)
-    level = np.zeros(count, np.int32)
+def depth_of(slots):
+    """The most nodes on a way from the root down; children come after their parents.
+
+    Args:
+        slots: (m, 8) uint32, as from `describe_slots`.
+    """
+    level = np.zeros(len(slots), np.int32)
     level[0] = 1
     depth = np.int32(1)
-    for node in range(count):
-        below = np.int32(level[node] + 1)
-        base = np.int64(words[node, 0]) & 0xFFFFFFF
-        block = top_count + (np.int64(words[node, 1]) & 0xFFFFFF)
+    for node in range(len(slots)):
         depth = max(depth, level[node])
         for slot in range(WIDTH):
-            if (records[node, 14] >> slot) & 1:
-                level[base] = below
-                base += 1
-            elif node < top_count and records[node, LOW + slot] <= records[node, LOW + 3 * WIDTH + slot]:
-                level[block] = below
-                block += 1
+            if slots[node, slot] < SLOT_IS_LEAF:
+                level[slots[node, slot]] = level[node] + 1
     return depth
 
 
 @kernel
 def describe_slots(nodes, planes, top_count, first_run, runs, slots):
-    """Say of each slot of each node where its child is, so that a walk has neither to count nor to search.
+    """Say of each slot of each node where its child is: a walk has neither to count slots nor to find runs.
 
     Args:
         nodes: (m, 16) uint32, SPEC 4.4.
@@ -42,19 +53,20 @@ def describe_slots(nodes, planes, top_count, first_run, runs, slots):
         top_count: How many nodes are over blocks.
         first_run: (b,) uint32.
         runs: (r,) uint32, SPEC 4.5.
-        slots: (m, 8) uint32, written. A node, or with bit 31 set a run: bits 0 to 7 are its first triangle;
-            8 to 15 the strip; 16 to 20 what bits 27 to 31 of the run are; 21 on the turns of its triangles
-            and a one behind the last. A slot that is empty is a run of no triangles.
+        slots: (m, 8) uint32, written. The child, where that is a node, be it a block's root. Of a run bit 31
+            and, in bits 0 to 7, its first triangle; 8 to 15 the strip; 16 to 20 bits 27 to 31 of the run;
+            from 21 on the turns of its triangles, and a one behind the last. Of nothing a run that is empty.
     """
     for node in range(len(nodes)):
-        base = np.int64(nodes[node, 0]) & 0xFFFFFFF
-        block = np.int64(nodes[node, 1]) & 0xFFFFFF
-        run = np.int64(first_run[block]) + (np.int64(nodes[node, 1]) >> 24)
+        child = np.int64(nodes[node, 0]) & 0xFFFFFFF
+        leaves = np.int64(nodes[node, 1])
+        block = leaves & 0xFFFFFF
+        run = np.int64(first_run[block]) + (leaves >> 24)
         for slot in range(WIDTH):
-            said = np.int64(1) << 31 | 1 << 21
-            if (planes[node, 14] >> slot) & 1:
-                said = base
-                base += 1
+            said = np.int64(SLOT_IS_LEAF | 1 << 21)
+            if (planes[node, INNER] >> slot) & 1:
+                said = child
+                child += 1
             elif planes[node, LOW + slot] <= planes[node, LOW + 3 * WIDTH + slot]:
                 if node < top_count:
                     said = top_count + block
@@ -62,42 +74,43 @@ def describe_slots(nodes, planes, top_count, first_run, runs, slots):
                 else:
                     of_run = np.int64(runs[run])
                     turns = of_run >> 19 & 0xFF | 2 << (of_run >> 8 & 7)
-                    said = 1 << 31 | turns << 21 | (of_run >> 27) << 16 | (of_run >> 11 & 0xFF) << 8 | of_run & 0xFF
+                    said = SLOT_IS_LEAF | turns << 21 | (of_run >> 27) << 16
+                    said |= (of_run >> 11 & 0xFF) << 8 | of_run & 0xFF
                     run += 1
             slots[node, slot] = said
 
 
 @kernel
 def describe_blocks(headers, scale_exponent, blocks):
-    """Say of each block what a walk decodes it by.
+    """Say of each block what its triangles are decoded by: what a header says, worked out.
 
     Args:
         headers: (b, 8) uint32, SPEC 4.2.
         scale_exponent: Of the power of two that positions are multiplied by.
-        blocks: (b, 16) uint32, written: the first triangle; the first word; bits 0 to 7 of the third word the
-            triangles, less one, 8 to 11 the width of an index, 12 whether there are flips, from 13 on the
-            bit where vertices begin; bits 0 to 6 of the fourth the bits of a vertex, from 7 on the bit where
-            indices begin. Then four words for each axis: the anchor, a mask as wide as its numbers, the power
-            of two that they are multiplied by, and in bits 0 to 6 of the last word where they begin in a
-            vertex, 7 and 8 the mode, from 9 on the exponent of that power, plus 512.
+        blocks: (b, 16) uint32, written. Four words for each axis: the anchor; a mask as wide as its numbers;
+            the power of two that they are multiplied by, as float32, where that is normal; and in bits 0 to 6
+            where in a vertex they begin, 7 and 8 their mode, 9 to 18 the exponent of the power, plus `BIAS`,
+            and from 19 on their width. Then the block's first triangle; its first word; in bits 0 to 7 its
+            triangles, less one, 8 to 11 the width of an index, 12 whether there are flips, and from 13 on the
+            bit where vertices begin; in bits 0 to 6 the width of a vertex, and from 7 on the bit where
+            indices begin.
     """
     for block in range(len(headers)):
         connectivity, size = block_bits(headers, block)
-        triangles, vertices, _, flips, width = block_counts(headers, block)
-        blocks[block, 12] = headers[block, 0]
-        blocks[block, 13] = headers[block, 1]
-        blocks[block, 14] = triangles - 1 | width << 8 | flips << 12 | connectivity << 13
-        blocks[block, 15] = size // vertices | (2 + flips) * triangles << 7
+        triangles, vertices, _, has_flips, index_width = block_counts(headers, block)
         begin = np.int64(0)
         for axis in range(3):
-            mode, bits, anchor, exponent = axis_of(headers, block, axis)
-            exponent = scale_exponent if mode == 2 else exponent + scale_exponent
-            at = 4 * axis
-            blocks[block, at] = headers[block, 3 + axis]
-            blocks[block, at + 1] = (np.int64(1) << bits) - 1
-            blocks[block, at + 2] = (min(max(exponent, -126), 127) + 127) << 23
-            blocks[block, at + 3] = begin | mode << 7 | (exponent + 512) << 9
-            begin += bits
+            mode, width, _, exponent = axis_of(headers, block, axis)
+            exponent = scale_exponent + (0 if mode == 2 else exponent)
+            blocks[block, 4 * axis] = headers[block, 3 + axis]
+            blocks[block, 4 * axis + 1] = (np.int64(1) << width) - 1
+            blocks[block, 4 * axis + 2] = min(max(exponent + 127, 1), 254) << 23
+            blocks[block, 4 * axis + 3] = begin | mode << 7 | (exponent + BIAS) << 9 | width << 19
+            begin += width
+        blocks[block, HEAD] = headers[block, 0]
+        blocks[block, HEAD + 1] = headers[block, 1]
+        blocks[block, HEAD + 2] = triangles - 1 | index_width << 8 | has_flips << 12 | connectivity << 13
+        blocks[block, HEAD + 3] = size // vertices | (2 + has_flips) * triangles << 7
 
 
 @kernel
@@ -179,9 +192,11 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
 
 
 @inlined
-def corner_indices(words, bit, counts, t):
-    """The indices of triangle t of a block of these counts, its data from `bit` on: SPEC 4.3, alone."""
-    count, _, _, has_flips, width = counts
+def corner_indices(blocks, words, block, t):
+    """The indices of triangle t of a block: SPEC 4.3, alone."""
+    bit = np.int64(blocks[block, HEAD + 1]) << 5
+    said = np.int64(blocks[block, HEAD + 2])
+    count, width, has_flips = (said & 0xFF) + 1, said >> 8 & 15, said >> 12 & 1
 
     # Find the strip, and its first triangle, the last one up to t at which a strip starts.
     strip = np.int64(-1)
@@ -219,18 +234,26 @@ def power_of_two(exponent):
 
 
 @inlined
-def coordinate(number, mode, width, anchor, exponent, scale_exponent):
-    """A coordinate of any mode from its number, times 2**scale_exponent: zero where that is not normal."""
+def coordinate(number, mode, mask, anchor, exponent):
+    """A scaled coordinate of any mode from its number: zero where that is not normal.
+
+    Args:
+        number: What is written of it.
+        mode: 0 to 2.
+        mask: All bits that may be.
+        anchor: Of the block.
+        exponent: Of the power of two that it is multiplied by.
+    """
     whole = number + anchor
     size = abs(whole)
-    unit = power_of_two(exponent + scale_exponent)
+    unit = power_of_two(exponent)
     if mode == 2:
         # Take the bits of the float apart.
         bits = whole if whole >= 0 else -1 - whole
         field = bits >> 23
         size = bits & 0x7FFFFF | (0x800000 if field > 0 else 0)
-        unit = power_of_two(max(field, 1) - 150 + scale_exponent)
-    elif mode == 1 and number == (1 << width) - 1:
+        unit = power_of_two(max(field, 1) - 150 + exponent)
+    elif mode == 1 and number == mask:
         size = np.int64(0)
     exact = np.float64(size) * unit
     value = np.float32(exact) if exact >= np.float64(LEAST_NORMAL) else np.float32(0.0)
@@ -238,17 +261,16 @@ def coordinate(number, mode, width, anchor, exponent, scale_exponent):
 
 
 @kernel
-def decode_triangles(headers, words, names, count, scale_exponent, places, corners, turns):
+def decode_triangles(blocks, words, names, count, places, corners, turns):
     """Decode up to 64 triangles, step by step, so that one waits for memory while others do.
 
-    Corners are times 2**scale_exponent, what is not a normal number then is zero, as the walks have it.
+    Corners are scaled, what is not a normal number then is zero, as the walks have it.
 
     Args:
-        headers: (b, 8) uint32.
+        blocks: (b, 16) uint32, as from `describe_blocks`.
         words: (w,) uint32.
         names: (64,) int64, 256 times a triangle's block plus its number there.
         count: How many triangles.
-        scale_exponent: Of the power of two that positions are multiplied by.
         places: (3, 64) int64, room.
         corners: (9, 64) float32, written: x of corners a, b and c, in the order of the tests, then y, then z.
         turns: (64,) int32, written: the strip's corner that is the first in the order of the tests.
@@ -256,13 +278,9 @@ def decode_triangles(headers, words, names, count, scale_exponent, places, corne
     # Find where each corner's bits begin.
     for i in range(count):
         block = names[i] >> 8
-        bit = np.int64(headers[block, 1]) << 5
-        counts = block_counts(headers, block)
-        a, b, c = corner_indices(words, bit, counts, names[i] & 255)
-        triangles, _, strips, has_flips, index_width = counts
-        begin = bit + (2 + has_flips) * triangles + (triangles + 2 * strips) * index_width
-        packed = np.int64(headers[block, 6])
-        stride = (packed & 63) + (packed >> 8 & 63) + (packed >> 16 & 63)
+        a, b, c = corner_indices(blocks, words, block, names[i] & 255)
+        begin = (np.int64(blocks[block, HEAD + 1]) << 5) + (np.int64(blocks[block, HEAD + 2]) >> 13)
+        stride = np.int64(blocks[block, HEAD + 3]) & 127
         places[0, i] = begin + a * stride
         places[1, i] = begin + b * stride
         places[2, i] = begin + c * stride
@@ -270,22 +288,22 @@ def decode_triangles(headers, words, names, count, scale_exponent, places, corne
     # Take them.
     for i in range(count):
         block = names[i] >> 8
-        begin = np.int64(0)
         for axis in range(3):
-            mode, width, anchor, exponent = axis_of(headers, block, axis)
-            if mode == 0 and exponent + scale_exponent >= -126:
+            anchor = np.int64(np.int32(blocks[block, 4 * axis]))
+            said = np.int64(blocks[block, 4 * axis + 3])
+            begin, mode, width = said & 127, said >> 7 & 3, said >> 19
+            exponent = (said >> 9 & 1023) - BIAS
+            if mode == 0 and exponent >= -126:
                 # Integers of at most 24 bits and a normal power of two: float32 is exact.
-                power = np.int32((exponent + scale_exponent + 127) << 23).view(np.float32)
+                power = np.int32(blocks[block, 4 * axis + 2]).view(np.float32)
                 for j in range(3):
                     whole = take(words, places[j, i] + begin, width) + anchor
                     corners[3 * axis + j, i] = np.float32(whole) * power
             else:
+                mask = np.int64(blocks[block, 4 * axis + 1])
                 for j in range(3):
                     number = take(words, places[j, i] + begin, width)
-                    corners[3 * axis + j, i] = coordinate(
-                        number, mode, width, anchor, exponent, scale_exponent
-                    )
-            begin += width
+                    corners[3 * axis + j, i] = coordinate(number, mode, mask, anchor, exponent)
 
     # Turn them.
     for i in range(len(turns)):
@@ -317,12 +335,11 @@ def weigh_packed_hits(
     at,
     found_t,
     found,
-    headers,
+    blocks,
     words,
     faces,
     rotations,
     scale,
-    scale_exponent,
     t,
     face,
     u,
@@ -337,12 +354,11 @@ def weigh_packed_hits(
         at: (k,) int32, the rays that results are for, negative for none; others are left alone.
         found_t: (k,) float32, t of each.
         found: (k,) int32, 256 times its block plus its number there; negative on a miss.
-        headers: (b, 8) uint32.
+        blocks: (b, 16) uint32, as from `describe_blocks`.
         words: (w,) uint32.
         faces: (>= n,) int32, the reported face of each triangle; (0,) where triangles are faces.
         rotations: (n,) uint8, places that the reported face's corners were turned to the left; or (0,).
         scale: float32, what positions are multiplied by.
-        scale_exponent: Its exponent.
         t: (r,) float32, written.
         face: (r,) int32, written.
         u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
@@ -367,7 +383,7 @@ def weigh_packed_hits(
             number = np.int64(-1)
             face[r] = found[k]
             if name >= 0:
-                number = np.int64(headers[name >> 8, 0]) + (name & 255)
+                number = np.int64(blocks[name >> 8, HEAD]) + (name & 255)
                 face[r] = faces[number] if len(faces) > 0 else number
             triangle[r] = number
             if weighed and name < 0:
@@ -381,7 +397,7 @@ def weigh_packed_hits(
                 ray_of[held] = r
                 held += 1
         if held == CHUNK or (held > 0 and k == len(at) - 1):
-            decode_triangles(headers, words, names, distinct, scale_exponent, places, corners, turns)
+            decode_triangles(blocks, words, names, distinct, places, corners, turns)
             for i in range(held):
                 r, slot = ray_of[i], slot_of[i]
                 axes = take_ray(origins, directions, r, room, i)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from striptools.kernels.compiled import kernel
-from striptools.kernels.packed_hits import decode_triangles
+from striptools.kernels.packed_hits import HEAD, decode_triangles
 from striptools.kernels.rays import longest_axis
 from striptools.kernels.weighing import CHUNK
 from striptools.kernels.wide import flushed
@@ -29,15 +29,14 @@ def block_corners(names, place, blocks, corners, turns):
 
 
 @kernel
-def packed_corners(names, headers, words, rotations, scale_exponent, corners, turns):
+def packed_corners(names, blocks, words, rotations, corners, turns):
     """Decode triangles of packed blocks.
 
     Args:
         names: (k,) int32, 256 times the block plus the number there.
-        headers: (b, 8) uint32.
+        blocks: (b, 16) uint32, as `kernels.packed_hits.describe_blocks` writes them.
         words: (w,) uint32.
         rotations: (n,) uint8, places that the reported face's corners were turned to the left; or (0,).
-        scale_exponent: Of the power of two that positions are multiplied by.
         corners: (k, 3, 3) float32, written: a row an axis, a column a corner, in the order of the tests.
         turns: (k,) int32, written: corner j is the reported face's (j + turn) % 3.
     """
@@ -48,11 +47,11 @@ def packed_corners(names, headers, words, rotations, scale_exponent, corners, tu
     for begin in range(0, len(names), CHUNK):
         count = min(CHUNK, len(names) - begin)
         wanted[:count] = names[begin : begin + count]
-        decode_triangles(headers, words, wanted, count, scale_exponent, places, decoded, turned)
+        decode_triangles(blocks, words, wanted, count, places, decoded, turned)
         for i in range(count):
             for row in range(9):
                 corners[begin + i, row // 3, row % 3] = decoded[row, i]
-            number = np.int64(headers[wanted[i] >> 8, 0]) + (wanted[i] & 255)
+            number = np.int64(blocks[wanted[i] >> 8, HEAD]) + (wanted[i] & 255)
             rotation = rotations[number] if len(rotations) > 0 else 0
             turns[begin + i] = (turned[i] + rotation) % 3
 

@@ -1,17 +1,23 @@
 """How many bytes a tracer keeps of a scene, counted without tracing; tests compare with the tracer's count.
 
-Expanded: 320 bytes a run, 224 a node, and 8 a face of the source. Compressed: nodes, runs, blocks and remap
-as they are in a file that stores its boxes, else in size classes.
+Expanded: 320 bytes a run, 224 a node, and 8 a face of the source. Compressed: nodes, block data and remap as
+they are in a file that stores its boxes, else in size classes, and beside them what is worked out of headers
+and runs, 64 bytes a block and 32 a node.
 """
 
 import math
-from typing import Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
 
-from striptools.reducem.scene import Scene
+if TYPE_CHECKING:
+    from striptools.hierarchies.packed import PackedNodes
+    from striptools.reducem.blocks import Blocks
+    from striptools.reducem.scene import Scene
 
 Residency = Literal["expanded", "compressed"]
 
 RUN_BYTES, NODE_BYTES, FACE_BYTES = 320, 224, 8
+NODE_RECORD_BYTES, SLOTS_BYTES, BLOCK_BYTES, WORD_BYTES = 64, 32, 64, 4
 EXPANDED_STEPS, COMPRESSED_STEPS = 4, 16
 """Size classes to each doubling."""
 
@@ -27,7 +33,7 @@ def size_class(count: int, steps: int = EXPANDED_STEPS) -> int:
     return size
 
 
-def resident_bytes(scene: Scene, resident: Residency) -> int | None:
+def resident_bytes(scene: "Scene", resident: Residency) -> int | None:
     """What a tracer keeps of a scene through its stored hierarchy; None where that is not counted here.
 
     A GPU keeps the nodes of a compressed scene once more, as bytes (`Tracer.resident_bytes`).
@@ -45,11 +51,24 @@ def resident_bytes(scene: Scene, resident: Residency) -> int | None:
         faces = scene.triangle_count if scene.remap is None else int(scene.remap.face.max()) + 1
         kept = RUN_BYTES * size_class(len(packed.runs)) + NODE_BYTES * size_class(len(packed.nodes) + 1)
         return kept + FACE_BYTES * faces
-    arrays = [packed.nodes, scene.blocks.headers, scene.blocks.words, packed.first_run, packed.runs]
-    turns = 0
+    stored = scene.packed.runs is not None
+
+    def room(count: int) -> int:
+        return count if stored else size_class(count, COMPRESSED_STEPS)
+
+    kept = traced_bytes(scene.blocks, packed, room)
     if scene.remap is not None:
-        arrays.append(scene.remap.face)
-        turns = scene.remap.rotation.nbytes
-    if scene.packed.runs is not None:
-        return sum(array.nbytes for array in arrays) + turns
-    return sum(array[:1].nbytes * size_class(len(array), COMPRESSED_STEPS) for array in arrays) + turns
+        kept += scene.remap.face[:1].nbytes * room(len(scene.remap.face)) + scene.remap.rotation.nbytes
+    return kept
+
+
+def traced_bytes(blocks: "Blocks", packed: "PackedNodes", room: Callable[[int], int] = int) -> int:
+    """What a tracer keeps of nodes and blocks without unpacking them.
+
+    Args:
+        blocks: The blocks.
+        packed: All nodes.
+        room: How many there is room for, where there are so many.
+    """
+    of_nodes = (NODE_RECORD_BYTES + SLOTS_BYTES) * room(len(packed.nodes))
+    return of_nodes + BLOCK_BYTES * room(blocks.count) + WORD_BYTES * room(len(blocks.words))

@@ -23,6 +23,7 @@ from striptools.reducem.blocks import Blocks, Decoded, decode_blocks, described_
 from striptools.reducem.geometries import SceneGeometries, SceneInstances, roots_of
 from striptools.reducem.layout import LONGEST_RUN
 from striptools.reducem.plain_triangles import PlainTriangles
+from striptools.reducem.resident import traced_bytes
 from striptools.strips.topology import Strips, decode_strips
 from striptools.threads import every_core, in_chunks
 from striptools.types import Bools, Boxes, Counts, FaceIds, Faces, Positions, Rotations
@@ -413,14 +414,12 @@ class Scene:
     def resident_bytes_per_triangle(self) -> float:
         """Say what tracing without unpacking holds, over the triangles; 0 under another hierarchy.
 
-        That is the blocks and the complete hierarchy as a file with boxes stored has them; neither the remap
-        nor the few per cent by which a tracer rounds arrays up that no file holds.
+        That is block data and nodes as a file with boxes stored has them, and what is worked out of headers and
+        runs; neither the remap nor the few per cent by which a tracer rounds arrays up that no file holds.
         """
         if self.hierarchy is not None:
             return 0.0
-        packed = self.with_boxes()
-        held = [self.blocks.headers, self.blocks.words, packed.nodes, packed.first_run, packed.runs]
-        return sum(array.nbytes for array in held if array is not None) / max(1, self.triangle_count)
+        return traced_bytes(self.blocks, self.with_boxes()) / max(1, self.triangle_count)
 
 
 _FIELDS = frozenset(f.name for f in fields(Scene))

@@ -40,9 +40,6 @@ class PackedLayout:
     """
 
     arrays: PackedScene
-    headers: np.ndarray
-    top_count: int
-    scale_exponent: int
     blocks: int
     rotations: np.ndarray
     decode: Decode
@@ -51,8 +48,13 @@ class PackedLayout:
     @property
     def triangles(self) -> int:
         """How many there are."""
-        last = self.headers[self.blocks - 1]
-        return int(last[0]) + int(last[2] & 0xFF) + 1
+        last = self._blocks[-1]
+        return int(last[kernels.HEAD]) + int(last[kernels.HEAD + 2] & 0xFF) + 1
+
+    @property
+    def _blocks(self) -> np.ndarray:
+        """What is said of the blocks, without what fills up the size class."""
+        return self.arrays.blocks[: self.blocks]
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
@@ -63,13 +65,8 @@ class PackedLayout:
         planes = record[16:].reshape(2, 3, WIDTH).astype(np.int64)
         empty = planes[0, 0] > planes[1, 0]
         boxes = (origin[:, None] + (planes << shift[:, None])).reshape(6, WIDTH).astype(np.float32)
-        inner = np.unpackbits(record[14:15], bitorder="little") == 1
-        leaf = ~inner & ~empty
-        rank = np.cumsum(leaf) - 1
-        child = np.where(inner, (word[0] & 0xFFFFFFF) + np.cumsum(inner) - 1, -1 - np.arange(WIDTH))
-        top = self.top_count
-        if top:
-            child = np.where(leaf, top + (word[1] & 0xFFFFFF) + rank, child)
+        said = self.arrays.slots[0].view(np.int32)
+        child = np.where(said < 0, -1 - np.arange(WIDTH), said)
         return np.where(empty, np.float32(np.nan), boxes), child.astype(np.int32)
 
     @property
@@ -90,7 +87,7 @@ class PackedLayout:
     def nbytes(self) -> int:
         """Bytes of all arrays; planes are the nodes' memory."""
         arrays = self.arrays
-        held = (arrays.nodes, self.headers, arrays.words, arrays.slots, arrays.blocks, arrays.faces)
+        held = (arrays.nodes, arrays.slots, arrays.blocks, arrays.words, arrays.faces)
         return sum(a.nbytes for a in held) + self.rotations.nbytes
 
     @property
@@ -100,23 +97,21 @@ class PackedLayout:
 
     def corners_of(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `layout.Layout`."""
-        arrays = self.arrays
         corners, turns = np.zeros((len(names), 3, 3), np.float32), np.zeros(len(names), np.int32)
-        given = (names, self.headers[: self.blocks], arrays.words, self.rotations)
-        packed_corners(*given, self.scale_exponent, corners, turns)
+        packed_corners(names, self._blocks, self.arrays.words, self.rotations, corners, turns)
         return corners, turns
 
     def named(self, names: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faces and triangles of what the walk names, and how the corners of the file's are turned."""
-        triangles = (self.headers[names >> 8, 0] + (names & 0xFF)).astype(np.int32)
+        triangles = (self._blocks[names >> 8, kernels.HEAD] + (names & 0xFF)).astype(np.int32)
         faces = self.arrays.faces[triangles] if self.arrays.has_faces else triangles
         turns = self.rotations[triangles] if len(self.rotations) else np.zeros(len(names), np.uint8)
         return faces, triangles, turns
 
     def names(self) -> np.ndarray:
         """See `layout.Layout`: 256 times the block and the number there."""
-        headers = self.headers[: self.blocks]
-        first, count = headers[:, 0].astype(np.int64), (headers[:, 2] & 0xFF).astype(np.int64) + 1
+        said = self._blocks[:, kernels.HEAD :].astype(np.int64)
+        first, count = said[:, 0], (said[:, 2] & 0xFF) + 1
         block = np.repeat(np.arange(self.blocks), count)
         return (block << 8 | (np.arange(len(block)) - first[block])).astype(np.int32)
 
@@ -129,23 +124,16 @@ class PackedLayout:
     def weigh(self, rays: Rays, at: np.ndarray, traced: tuple[np.ndarray, ...], found: Found) -> None:
         """Fill in what was found of the rays `at`: t, face, u, v and triangle."""
         arrays = self.arrays
-        headers = self.headers[: self.blocks]
-        kept = (
-            headers,
-            arrays.words,
-            arrays.faces,
-            self.rotations,
-            arrays.frame.scale,
-            self.scale_exponent,
-        )
+        kept = (self._blocks, arrays.words, arrays.faces, self.rotations, arrays.frame.scale)
         kernels.weigh_packed_hits(rays[0], rays[1], at, traced[0], traced[1], *kept, *found)
 
 
 def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     """Lay a scene out for the walk through its blocks; nodes that the file does not hold are built.
 
-    Arrays of a scene that holds its boxes are taken as they lie, in a mapped file too, where that is from a
-    cache line on; others are copied to a size class, so that scenes of like size share a program.
+    Nodes and streams of a scene that holds its boxes are taken as they lie, in a mapped file too, where that
+    is from a cache line on; others are copied to a size class, so that scenes of like size share a program.
+    What headers and runs say is worked out, as to do so at each visit would take longer than the visit.
 
     JAX uses arrays that start at a cache line where they lie on a CPU, and copies others. So nodes and planes
     are one memory there; a GPU has them twice, as words and as bytes.
@@ -159,27 +147,24 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
         )
     assert packed.first_run is not None
     assert packed.runs is not None
-    laid: Callable[[np.ndarray], np.ndarray] = _padded if scene.packed.runs is None else _aligned
+    stored = scene.packed.runs is not None
+    laid: Callable[[np.ndarray], np.ndarray] = _aligned if stored else _padded
     scale = scale_of(scene)
     exponent = int(np.frexp(scale)[1]) - 1
     faces, rotations = _names(scene, laid)
-    nodes = laid(packed.nodes)
+    nodes, count = laid(packed.nodes), len(packed.nodes)
+    records = nodes.view(np.uint8)
     slots = aligned_zeros((len(nodes), WIDTH), np.uint32)
-    given = packed.nodes, packed.nodes.view(np.uint8), packed.top_count, packed.first_run, packed.runs
-    kernels.describe_slots(*given, slots)
-    described = aligned_zeros((size_class(len(blocks.headers), STEPS), 16), np.uint32)
-    kernels.describe_blocks(blocks.headers, exponent, described)
-    arrays = PackedScene(
-        nodes,
-        nodes.view(np.uint8).reshape(len(nodes), WIDTH, WIDTH),
-        slots,
-        described,
-        laid(blocks.words),
-        faces,
-        _frame(scene, scale, exponent),
-    )
-    depth = int(kernels.depth_of(packed.nodes, packed.nodes.view(np.uint8), packed.top_count))
-    return PackedLayout(arrays, blocks.headers, packed.top_count, exponent, blocks.count, rotations, decode_of(blocks, exponent), depth)
+    of_nodes = nodes[:count], records[:count], packed.top_count
+    kernels.describe_slots(*of_nodes, packed.first_run, packed.runs, slots[:count])
+    rows = blocks.count if stored else size_class(blocks.count, STEPS)
+    said = aligned_zeros((rows, kernels.BLOCK_WORDS), np.uint32)
+    kernels.describe_blocks(blocks.headers, exponent, said)
+    planes = records.reshape(-1, WIDTH, WIDTH)
+    frame = _frame(scene, scale, exponent)
+    arrays = PackedScene(nodes, planes, slots, said, laid(blocks.words), faces, frame)
+    depth = int(kernels.depth_of(slots[:count]))
+    return PackedLayout(arrays, blocks.count, rotations, decode_of(blocks, exponent), depth)
 
 
 def decode_of(blocks: "Blocks", scale_exponent: int) -> Decode:

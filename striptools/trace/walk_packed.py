@@ -34,6 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from striptools.kernels.packed_hits import BIAS, HEAD
 from striptools.trace.box import Slab, passes
 from striptools.trace.counters import Counters
 from striptools.trace.numerics import index
@@ -180,21 +181,20 @@ class PackedScene(NamedTuple):
         """The triangles of a run, decoded, their corners along these axes."""
         assert decode is not None
         x, y, z = self._decoded(where, axes, decode)
-        turn = _first_corner_along(x, y, z, axes)
-        return Leaf(tuple(x), tuple(y), tuple(z), turn, *self._named(where))
+        return Leaf(x, y, z, _first_corner_along(x, y, z, axes), *self._named(where))
 
     def leaf_for_packets(
         self, axes: tuple[Array, Array, Array], where: "_Run", decode: Decode | None
     ) -> Callable[[], Leaf]:
         """The same, decoded once: behind a cond, or XLA decodes it anew for every use."""
         assert decode is not None
-        nothing = ([jnp.zeros(LANES)] * 3,) * 3
+        nothing = ((jnp.zeros(LANES),) * 3,) * 3
         # Always so, which XLA does not know.
         x, y, z = lax.cond(
             where.block <= BLOCK_BITS, lambda: self._decoded(where, axes, decode), lambda: nothing
         )
         turn = _first_corner_along(x, y, z, axes)
-        return lambda: Leaf(tuple(x), tuple(y), tuple(z), turn, *self._named(where))
+        return lambda: Leaf(x, y, z, turn, *self._named(where))
 
     def _named(self, where: "_Run") -> tuple[Array, Array]:
         """Which lanes hold a triangle of a run, and their names."""
@@ -203,11 +203,18 @@ class PackedScene(NamedTuple):
 
     def _decoded(
         self, where: "_Run", axes: tuple[Array, Array, Array], decode: Decode
-    ) -> tuple[list[Array], ...]:
+    ) -> tuple[Corners, Corners, Corners]:
         """Coordinates along axes of the corners a, b, c of a run's triangles, scaled."""
-        block = _Block(*self._settled(self._row(self.blocks, where.block, 12, 4)))
-        along = [_Axis(*self._settled(self._row(self.blocks, where.block, axis * 4 & 12, 4))) for axis in axes]
-        return self._positions(block, self._corners(block, where, decode.flips), along, decode)
+        block, along = self.block_along(where, axes)
+        found = self._positions(block, self._corners(block, where, decode.flips), along, decode)
+        x, y, z = ((a, b, c) for a, b, c in found)
+        return x, y, z
+
+    def block_along(self, where: "_Run", axes: tuple[Array, Array, Array]) -> tuple["_Block", list["_Axis"]]:
+        """What is said of a run's block, and of its axes in this order."""
+        along = [self._settled(self._row(self.blocks, where.block, axis * 4 & 12, 4)) for axis in axes]
+        block = self._settled(self._row(self.blocks, where.block, HEAD, 4))
+        return _Block(*block), [_Axis(*axis) for axis in along]
 
     def visit_leaf(self, ray: Sighted, where: "_Run", best: Best, options: WalkOptions) -> Best:
         """Decode the triangles of a run and test them, against the closest hit so far."""
@@ -235,7 +242,7 @@ class PackedScene(NamedTuple):
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""
         block, place = index(names) >> 8, index(names) & 0xFF
-        triangle = self._at(self.blocks, (block, np.uint32(12))) + place
+        triangle = self._at(self.blocks, (block, np.uint32(HEAD))) + place
         face = self._at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
         return jnp.where(names < 0, names, face)
 
@@ -318,7 +325,7 @@ class PackedScene(NamedTuple):
 
     def _positions(
         self, block: "_Block", corners: tuple[Array, ...], axes: list["_Axis"], decode: Decode
-    ) -> tuple[list[Array], ...]:
+    ) -> list[list[Array]]:
         """Scaled coordinates of the corners along axes, (8,) float32 each."""
         found = []
         for corner in corners:
@@ -327,7 +334,7 @@ class PackedScene(NamedTuple):
             loaded = [*self._words_at(block.word + (bit >> 5), decode.words), jnp.zeros_like(bit)]
             vertex = [a >> shift | b << 1 << (31 - shift) for a, b in pairwise(loaded)]
             found.append([_coordinate(vertex, axis, decode) for axis in axes])
-        return tuple([vertex[axis] for vertex in found] for axis in range(3))
+        return [[vertex[axis] for vertex in found] for axis in range(3)]
 
 
 class _Run(NamedTuple):
@@ -422,7 +429,7 @@ class _Axis(NamedTuple):
     @property
     def exponent(self) -> Array:
         """Of the scaled coordinates, or of the scale in mode 2: int32."""
-        return (self.rest >> 9).astype(jnp.int32) - 512
+        return (self.rest >> 9 & 1023).astype(jnp.int32) - BIAS
 
     @property
     def unit(self) -> Array:

@@ -20,9 +20,6 @@ from striptools.trace.triangle import Shear, edge_functions, sheared
 from striptools.trace.walk import WIDTH, Decode, Frame, Leaf, WalkScene
 from striptools.trace.walk_packed import (
     PackedScene,
-    axes_along,
-    first_place,
-    index_stream,
     power_of_two,
     used_bytes,
 )
@@ -238,9 +235,8 @@ class WideTile(NamedTuple):
 
 
 def _packed_arrays(scene: PackedScene) -> list[Any]:
-    """All but the frame and the planes, which nodes have too; a single number is an array of one."""
-    single = [jnp.reshape(a, 1) for a in (scene.top_count, scene.scale_exponent)]
-    return [*single, scene.nodes, scene.headers, scene.words, scene.first_run, scene.runs, scene.faces]
+    """All but the frame and the planes, which nodes have too."""
+    return [scene.nodes, scene.slots, scene.blocks, scene.words, scene.faces]
 
 
 class PackedTile(PackedScene):
@@ -253,11 +249,9 @@ class PackedTile(PackedScene):
     @classmethod
     def of(cls, scene: PackedScene, refs: list[Any], arithmetic: KernelArithmetic) -> "PackedTile":
         """References in the order of `_packed_arrays`."""
-        top_count, exponent = (refs[k][0] for k in range(2))
-        nodes, headers, words, first_run, runs = refs[2:7]
-        faces = refs[7] if scene.has_faces else scene.faces
-        strips = headers, words, first_run, runs, faces
-        tile = cls._make((nodes, None, *strips, top_count, exponent, scene.frame))
+        nodes, slots, blocks, words = refs[:4]
+        faces = refs[4] if scene.has_faces else scene.faces
+        tile = cls._make((nodes, None, slots, blocks, words, faces, scene.frame))
         tile.arithmetic, tile.mask, tile.lane = arithmetic, None, None
         return tile
 
@@ -306,20 +300,18 @@ class PackedTile(PackedScene):
     def lanes_crossed(self, shear: Shear, where: Any, decode: Decode | None) -> Array:
         """Along the strip: a triangle has two corners of the one before it, and one vertex more."""
         assert decode is not None
-        header = self._row(self.headers, where.block, 0, 8)
-        axes = axes_along(header, self.scale_exponent, shear.axes)
-        said = where.said
-        length, turns = (said >> 8 & 7).astype(np.int32), said >> 19
-        indices, width = index_stream(header)
+        block, axes = self.block_along(where, shear.axes)
+        turns, width = where.turns, block.index_width
+        length = self.triangles_of(where) - 1
 
         def corner(at: Array) -> Point:
-            index = self._windows(header[1], indices + at * width, np.uint32(0), 2)
+            index = self._windows(block.word, block.indices + at * width, np.uint32(0), 2)
             index = index & ((np.uint32(1) << width) - 1)
-            x, y, z = (three(a * 3) for a in self._positions(header, (index,), axes, decode))
+            x, y, z = (three(a * 3) for a in self._positions(block, (index,), axes, decode))
             (x, *_), (y, *_), _ = sheared(x, y, z, shear, self.arithmetic.sifting)
             return x, y
 
-        place = first_place(said)
+        place = where.place
 
         def test(carried: Any) -> Any:
             k, far, near, crossed = carried
@@ -331,7 +323,7 @@ class PackedTile(PackedScene):
             return k + 1, far, newest, crossed | jnp.where(may, np.int32(1) << k, np.int32(0))
 
         most = jnp.max(jnp.where(self.mask, length, np.int32(-1)))
-        first = corner(place - (said >> 27)), corner(place)
+        first = corner(place - where.back), corner(place)
         start = np.int32(0), *first, jnp.zeros_like(length)
         return lax.while_loop(lambda carried: carried[0] <= most, test, start)[3]
 
@@ -350,14 +342,11 @@ class PackedTile(PackedScene):
     def _at(self, values: Any, places: Any) -> Array:
         return plgpu.load(values.at[places], mask=self.mask)
 
-    def _row(self, rows: Any, row: Array, first: int, count: int) -> list[Array]:
+    def _row(self, rows: Any, row: Array, first: Any, count: int) -> list[Array]:
         return [plgpu.load(rows.at[row, first + k], mask=self.mask) for k in range(count)]
 
     def _words_at(self, places: Array, count: int) -> list[Array]:
         return [self._at(self.words, places + k) for k in range(count)]
-
-    def _once(self, values: Any, place: Any) -> Any:
-        return self._at(values, place)
 
     def _settled(self, values: Any) -> Any:
         return jax.tree.map(self.arithmetic.exact.settled, values)
