@@ -201,7 +201,7 @@ def test_memory_decides_what_auto_is(ball):
     count = ball.triangle_count
     small, large = (Tracer(ball, device="cpu", memory_budget=k * count) for k in (20, 200))
     assert (small.resident, large.resident) == ("compressed", "expanded")
-    assert small.resident_bytes < large.resident_bytes / 3
+    assert small.resident_bytes < large.resident_bytes / 2.5
     assert Tracer(ball, device="cpu").resident == "expanded"
 
 
@@ -239,7 +239,8 @@ def test_all_rays_at_once_have_the_same_hits(ball):
 def test_a_tree_that_goes_round_ends(ball):
     tracer = both(ball)[1]
     layout = tracer._layout
-    layout.arrays.nodes[:, 0] &= np.uint32(0xF0000000)
+    slots = layout.arrays.slots
+    slots[slots < 1 << 31] = 0
     tracer._take(layout)
     with pytest.raises(striptools.errors.StriptoolsError, match="did not end"):
         tracer.closest_hit(*rays_at(ball, 50, 0))

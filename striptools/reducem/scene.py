@@ -414,8 +414,8 @@ class Scene:
     def resident_bytes_per_triangle(self) -> float:
         """Say what tracing without unpacking holds, over the triangles; 0 under another hierarchy.
 
-        That is block data and nodes as a file with boxes stored has them, and what is worked out of headers and
-        runs; neither the remap nor the few per cent by which a tracer rounds arrays up that no file holds.
+        That is block data and nodes as a file with boxes stored has them, and what is worked out of headers
+        and runs; neither the remap nor the few per cent by which arrays are rounded up that no file holds.
         """
         if self.hierarchy is not None:
             return 0.0

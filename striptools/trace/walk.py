@@ -640,15 +640,15 @@ def nearer(best: Best, t: Array, name: Array, faces_of: Callable[[Array], Array]
         name: (8,) int32.
         faces_of: Where names are not faces, the faces of (8,) names.
     """
-    # Nothing found so far may be infinitely far, as are some misses.
-    hit = (t > 0) & (t <= smaller(best.nearest, HIGHEST))
+    hit = (t > 0) & (t <= best.nearest)
     found = _least(best, t, name, hit)
     if faces_of is None:
         return found
     tied = hit & (t == found.nearest)
-    several = jnp.sum(jnp.where(tied, np.int32(1), np.int32(0))) > jnp.where(
-        found.nearest < best.nearest, np.int32(1), np.int32(0)
-    )
+    alone = jnp.where(found.nearest < best.nearest, np.int32(1), np.int32(0))
+    several = jnp.sum(jnp.where(tied, np.int32(1), np.int32(0))) > alone
+    # As long as nothing is found, what is infinitely far may count as a hit.
+    several = several & (found.nearest <= HIGHEST)
     first = partial(_first_by_face, faces_of, best, found, tied, name)
     return found._replace(name=lax.cond(several, first, lambda: found.name))
 

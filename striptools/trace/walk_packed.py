@@ -155,7 +155,7 @@ class PackedScene(NamedTuple):
             axis = jnp.where(rows[k] >= 3, rows[k] - 3, rows[k])
             unit, low = (lax.dynamic_slice(a, (axis,), (1,))[0] for a in (self.frame.unit, self.frame.low))
             for each in planes[k : k + 2]:
-                cells = pick(tuple(origins), axis) + (each << pick(tuple(shifts), axis))
+                cells = pick(origins, axis) + (each << pick(shifts, axis))
                 sides.append(cells.astype(jnp.float32) * unit + low)
         return sides
 
@@ -246,11 +246,13 @@ class PackedScene(NamedTuple):
         face = self._at(self.faces, triangle) if self.has_faces else triangle.astype(jnp.int32)
         return jnp.where(names < 0, names, face)
 
-    def _grid(self, head: Any) -> tuple[list[Array], list[Array]]:
+    def _grid(self, head: Any) -> tuple[Corners, Corners]:
         """Where planes are counted from and how far they are shifted, int32 along each axis."""
-        origins = head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF
-        shifts = head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28
-        return [a.astype(jnp.int32) for a in origins], [a.astype(jnp.int32) for a in shifts]
+        x, y, z = (a.astype(jnp.int32) for a in (head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF))
+        along_x, along_y, along_z = (
+            a.astype(jnp.int32) for a in (head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28)
+        )
+        return (x, y, z), (along_x, along_y, along_z)
 
     # What follows says how arrays are read; the walk on a GPU reads them in its own way.
 
