@@ -1,4 +1,4 @@
-"""A scene of packed blocks, as the walk sees it: nodes, headers and bit streams as a scene file has them.
+"""A scene of packed blocks, as the walk sees it: nodes and bit streams as a scene file has them.
 
 Nodes follow Ylitie, Karras & Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs"
 (HPG 2017), leaves Lauterbach et al., ReduceM (EGSR 2008): a leaf is up to eight triangles of a strip, decoded
@@ -7,8 +7,10 @@ same corners, scaled by the same power of two, in the same test.
 
 Differences:
 
-1. A leaf is named by its node and slot, and its run is counted when it is visited. The run says where its
-   triangles' corners are in the strip, which saves reading start and turn bits.
+1. A leaf is named by its node and slot. What is in a node's slots, and what the headers of blocks say, is
+   worked out when the scene is laid out (`kernels.packed_hits`), 32 bytes a node and 64 a block: to do so at
+   each visit took a third of a leaf's instructions and a tenth of a node's. Of a run it says where its
+   triangles' corners are in the strip, so that no start or turn bit is read.
 2. What no block of the scene needs is not compiled in (`walk.Decode`).
 3. Corners are not put in the canonical order; only the sums are made in it (`triangle.crossing_of`).
 4. Lanes hold triangles, not faces: the remap is read where two hits have the same t, and nowhere else.
@@ -60,8 +62,11 @@ MARGIN = np.float32(2.0**-19)
 
 LANES = 8
 
-LEAF_BYTES = 40
-"""What a leaf reads beside its triangles: the run, where the block's runs begin, and the block's header."""
+NODE_BYTES = 64 + 4
+"""What a node reads: its boxes, and what is said of the slot that is visited next."""
+
+LEAF_BYTES = 4 + 4 + 64
+"""What a leaf reads beside its triangles: of its run, its block's number, and of its block."""
 
 TRIANGLE_BYTES = 3 + 3 * 10
 """What a triangle reads, about: three indices of a byte and three vertices of 80 bits."""
@@ -231,9 +236,9 @@ class PackedScene(NamedTuple):
         return (31 - _leading_zeros(where.turns)).astype(jnp.int32)
 
     def counters_of(self, nodes: Any, leaves: Any, triangles: Any) -> Counters:
-        """A node is eight boxes and 64 bytes; a leaf a run, a header, indices and vertices: see the notes."""
+        """A node is eight boxes and a slot; a leaf its run and block, indices and vertices: see the notes."""
         bytes_read = leaves * LEAF_BYTES + triangles * TRIANGLE_BYTES
-        return Counters(nodes, leaves, nodes * 8, triangles, nodes * 64, bytes_read)
+        return Counters(nodes, leaves, nodes * 8, triangles, nodes * NODE_BYTES, bytes_read)
 
     def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
         """Walk r rays made ready."""
@@ -576,3 +581,17 @@ def used_bytes(low: Array, high: Array) -> Array:
 # 1.03 (dragon) and 0.94 (bunny), a camera's rays one by one 0.87 to 0.9, since every other leaf of theirs is
 # hit; any hit 0.97 to 1.0, for which nothing is sifted. The decoded leaf kept for the cond 0.55; only the
 # lanes that may be nearer decoded again, one by one, 0.95 of sifting.
+#
+# Runs and headers worked out beforehand, axes read in a ray's order from rows of four words: a leaf's way
+# takes 590 instructions for 670, its finding and leaving 197 for 357, two rays' nodes 374 for 407. Camera in
+# packets 1.05 to 1.09, one by one 1.08 to 1.18, occlusion 1.08 to 1.17, any hit 1.0 to 1.05 (bunny, dragon).
+# In packets ties told apart without flags that are kept, 1.06 more: a ray that has hit nothing was tied with
+# each triangle that it missed, both infinitely far, and LLVM makes single steps of sums of 32 flags and of
+# short loops over 32 lanes.
+#
+# Where the time goes then (dragon, occlusion): nodes 38 %, 12.4 a ray at 30 ns; leaves 39 %, 3.0 a ray at 125
+# ns, of which a sixth waits for memory and most is put together lane by lane (96 words, for which XLA uses no
+# gather); finding and leaving them 7 %. No gain: words gathered as rows of four 1.0; no barriers 0.95 to
+# 1.03; any hit sifted 0.99 to 1.03; words of indices in one slice and products of small numbers 1.0; four
+# rays side by side 0.91 to 1.0, one 0.83 to 0.94; LLVM told not to unroll 0.91 to 1.0, not to make branches
+# of selects 0.96 to 1.0 (all of `xla_backend_extra_options` with a dash in front).
