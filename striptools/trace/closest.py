@@ -3,7 +3,6 @@
 from functools import lru_cache, partial
 from typing import Any
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float32
@@ -11,7 +10,7 @@ from jaxtyping import Float32
 from striptools.trace.gathering import check_ended
 from striptools.trace.hit import ClosestPoints
 from striptools.trace.instanced import InstancedLayout
-from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, TILES, stream_through
+from striptools.trace.launch import GPU_TILES, TILES, split_over, stream_through
 from striptools.trace.layout import Layout
 from striptools.trace.walk import MISS
 from striptools.trace.walk_points import FARTHEST, PointOptions, closest_triangles
@@ -26,14 +25,8 @@ def program(mesh: Mesh, options: PointOptions, shared: bool = False) -> Any:
 
     To `walk_points_instances.ClosestInstance` where geometries are shared by instances.
     """
-    split = jax.shard_map(
-        partial(closest_triangles, options=options, walk_one=walk_point_among_instances if shared else None),
-        mesh=mesh,
-        in_specs=(EVERYWHERE, RAYS),
-        out_specs=RAYS,
-        check_vma=False,
-    )
-    return jax.jit(split)
+    walk_one = walk_point_among_instances if shared else None
+    return split_over(mesh, partial(closest_triangles, options=options, walk_one=walk_one), 1)
 
 
 def nothing_closest(count: int) -> ClosestPoints:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
@@ -21,7 +20,7 @@ from striptools.hierarchies.wide import EMPTY, WideTree
 from striptools.mesh.instances import Instances
 from striptools.trace.box import MARGIN, REACH, U
 from striptools.trace.counters import Counters
-from striptools.trace.launch import EVERYWHERE, GPU_TILES, RAYS, stream_through
+from striptools.trace.launch import GPU_TILES, split_over, stream_through
 from striptools.trace.layout import Found, Layout, PacketView, Rays, blocks_of
 from striptools.trace.leaves import LeafBlocks, aligned_full, lay_out_wide, scale_for, scale_of, size_class
 from striptools.trace.packed import lay_out_packed
@@ -315,14 +314,7 @@ def _turned(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=16)
 def instances_program(mesh: Mesh, options: WalkOptions) -> Any:
     """The jitted function from a scene and rays to `InstancesTraced`, the rays split over the devices."""
-    split = jax.shard_map(
-        partial(trace_instances, options=options),
-        mesh=mesh,
-        in_specs=(EVERYWHERE, RAYS, RAYS, RAYS),
-        out_specs=RAYS,
-        check_vma=False,
-    )
-    return jax.jit(split)
+    return split_over(mesh, partial(trace_instances, options=options), 3)
 
 
 def lay_out_instanced(

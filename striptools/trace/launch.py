@@ -58,12 +58,16 @@ def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     Rays are (origins, directions, t_max) where all are walked at once, else ready ones or ready packets.
     """
     walk, arrays = _walk_of(options, packets)
+    return split_over(mesh, partial(walk, options=options), arrays)
+
+
+def split_over(mesh: Mesh, walk: Callable[..., Any], arrays: int) -> Any:
+    """The jitted function from a scene and so many arrays of rays, or of points, to what a walk says of each.
+
+    The scene is whole on each device; rays are split over the devices, and so is what is said of them.
+    """
     split = jax.shard_map(
-        partial(walk, options=options),
-        mesh=mesh,
-        in_specs=(EVERYWHERE, *(RAYS,) * arrays),
-        out_specs=RAYS,
-        check_vma=False,
+        walk, mesh=mesh, in_specs=(EVERYWHERE, *(RAYS,) * arrays), out_specs=RAYS, check_vma=False
     )
     on_cpu = mesh.devices.flat[0].platform == "cpu"
     return jax.jit(split, compiler_options=LEFT_IN_LOOPS if on_cpu else None)
