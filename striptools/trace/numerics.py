@@ -78,7 +78,6 @@ class Arithmetic(NamedTuple):
         smaller: Of two that compare.
         larger: Of two that compare.
         settled: A value that is not computed again for each use.
-        ones: How many bits of a uint32 are set.
     """
 
     product: Callable[[Array, Array], Array]
@@ -86,7 +85,6 @@ class Arithmetic(NamedTuple):
     smaller: Callable[[Array, Array], Array]
     larger: Callable[[Array, Array], Array]
     settled: Callable[[Array], Array]
-    ones: Callable[[Array], Array]
 
 
 BY_XLA = Arithmetic(
@@ -95,7 +93,6 @@ BY_XLA = Arithmetic(
     smaller,
     larger,
     lax.optimization_barrier,
-    lax.population_count,
 )
 
 

@@ -72,7 +72,6 @@ TRIANGLE_BYTES = 3 + 3 * 10
 """What a triangle reads, about: three indices of a byte and three vertices of 80 bits."""
 
 BLOCK_BITS = 0xFFFFFF
-ALL = np.uint32(0xFFFFFFFF)
 
 
 class PackedScene(NamedTuple):
@@ -290,10 +289,6 @@ class PackedScene(NamedTuple):
     def _settled(self, values: Any) -> Any:
         """Values that are not computed again for each use."""
         return lax.optimization_barrier(values)
-
-    def _ones(self, values: Array) -> Array:
-        """How many bits are set."""
-        return lax.population_count(values)
 
     def _corners(self, block: "_Block", run: "_Run", flips: bool) -> tuple[Array, Array, Array]:
         """The indices of corners a, b, c of a run's triangles, (8,) uint32 each."""

@@ -30,9 +30,6 @@ _FUSED = "fma.rn.ftz.f32 $0, $1, $2, $3;"
 
 _ONE_AND_BYTE = "prmt.b32 $0, $1, 0x3F800000, $2;"
 
-_ONES = "popc.b32 $0, $1;"
-"""Triton has no such operation of its own."""
-
 
 def _instruction(assembly: str, kind: Any, constraint: str) -> Callable[..., Array]:
     """A function of arrays, of one kind and of shapes that broadcast."""
@@ -85,7 +82,6 @@ _EXACT = Arithmetic(
     lax.min,
     lax.max,
     lambda a: a,
-    lambda a: _instruction(_ONES, np.int32, "r")(a).astype(np.uint32),
 )
 """Of a number and what is none, the smaller and the larger are the number."""
 

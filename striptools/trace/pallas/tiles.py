@@ -351,9 +351,6 @@ class PackedTile(PackedScene):
     def _settled(self, values: Any) -> Any:
         return jax.tree.map(self.arithmetic.exact.settled, values)
 
-    def _ones(self, values: Array) -> Array:
-        return self.arithmetic.exact.ones(values)
-
 
 def _bits(values: Array) -> Array:
     return lax.bitcast_convert_type(values, np.int32)
