@@ -94,10 +94,10 @@ class Tracer:
             triangles first, which takes longer to build, is faster to walk, most where triangles are of very
             different sizes, and is expanded. Hits are the same.
         resident: "expanded" keeps boxes and corners as float32, 65 bytes a triangle and more; "compressed"
-            keeps the blocks as they are, 9 bytes and 5 of the remap, and decodes triangles where they are
-            tested, which is slower. Where the scene holds its boxes ("stored"), a CPU uses all that where the
-            file is mapped and copies nothing; the price is a program of its own for each such scene. Hits are
-            the same. "auto" expands what fits in `memory_budget`.
+            keeps the blocks as they are, 9 to 11 bytes and 5 of the remap, and decodes triangles where they
+            are tested, which is slower. Where the scene holds its boxes ("stored"), a CPU uses nodes, block
+            data and remap where the file is mapped and copies none of it; the price is a program of its own
+            for each such scene. Hits are the same. "auto" expands what fits in `memory_budget`.
         memory_budget: Bytes that an expanded scene may take with "auto"; None for a quarter of the memory
             that is free on the device, or on this machine where the device does not tell.
         instances: "flattened" expands the triangles of every instance where it stands; "shared" keeps each
