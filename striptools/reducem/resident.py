@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 Residency = Literal["expanded", "compressed"]
 
 RUN_BYTES, NODE_BYTES, FACE_BYTES = 320, 224, 8
-NODE_RECORD_BYTES, SLOTS_BYTES, BLOCK_BYTES, WORD_BYTES = 64, 32, 64, 4
+NODE_RECORD_BYTES, SLOTS_BYTES, WORD_BYTES, BLOCK_WORDS = 64, 32, 4, 16
+BLOCK_BYTES = WORD_BYTES * BLOCK_WORDS
 EXPANDED_STEPS, COMPRESSED_STEPS = 4, 16
 """Size classes to each doubling."""
 
@@ -71,4 +72,5 @@ def traced_bytes(blocks: "Blocks", packed: "PackedNodes", room: Callable[[int], 
         room: How many there is room for, where there are so many.
     """
     of_nodes = (NODE_RECORD_BYTES + SLOTS_BYTES) * room(len(packed.nodes))
-    return of_nodes + BLOCK_BYTES * room(blocks.count) + WORD_BYTES * room(len(blocks.words))
+    of_blocks = BLOCK_BYTES * (room(BLOCK_WORDS * blocks.count) // BLOCK_WORDS)
+    return of_nodes + of_blocks + WORD_BYTES * room(len(blocks.words))

@@ -157,7 +157,9 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     slots = aligned_zeros((len(nodes), WIDTH), np.uint32)
     of_nodes = nodes[:count], records[:count], packed.top_count
     kernels.describe_slots(*of_nodes, packed.first_run, packed.runs, slots[:count])
-    rows = blocks.count if stored else size_class(blocks.count, STEPS)
+    # Classes are of words: few blocks do not take the room of a thousand.
+    words = kernels.BLOCK_WORDS * blocks.count
+    rows = (words if stored else size_class(words, STEPS)) // kernels.BLOCK_WORDS
     said = aligned_zeros((rows, kernels.BLOCK_WORDS), np.uint32)
     kernels.describe_blocks(blocks.headers, exponent, said)
     planes = records.reshape(-1, WIDTH, WIDTH)
