@@ -5,12 +5,8 @@ import numpy as np
 from striptools.kernels.bits import bits_set, highest_bit
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import inlined, kernel
-from striptools.kernels.packed_nodes import LOW
 from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
-from striptools.kernels.wide import LEAST_NORMAL, WIDTH, precedes
-
-INNER = 14
-"""The byte of a node that says which slots hold nodes."""
+from striptools.kernels.wide import EMPTY, LEAST_NORMAL, WIDTH, precedes
 
 SLOT_IS_LEAF = 1 << 31
 """Set in what is said of a slot that holds a leaf, or nothing."""
@@ -44,39 +40,26 @@ def depth_of(slots):
 
 
 @kernel
-def describe_slots(nodes, planes, top_count, first_run, runs, slots):
+def describe_slots(child, runs, slots):
     """Say of each slot of each node where its child is: a walk has neither to count slots nor to find runs.
 
     Args:
-        nodes: (m, 16) uint32, SPEC 4.4.
-        planes: (m, 64) uint8, the same bytes.
-        top_count: How many nodes are over blocks.
-        first_run: (b,) uint32.
+        child: (m, 8) int32, as from `kernels.packed_nodes.slot_children`.
         runs: (r,) uint32, SPEC 4.5.
         slots: (m, 8) uint32, written. The child, where that is a node, be it a block's root. Of a run bit 31
             and, in bits 0 to 7, its first triangle; 8 to 15 the strip; 16 to 20 bits 27 to 31 of the run;
             from 21 on the turns of its triangles, and a one behind the last. Of nothing a run that is empty.
     """
-    for node in range(len(nodes)):
-        child = np.int64(nodes[node, 0]) & 0xFFFFFFF
-        leaves = np.int64(nodes[node, 1])
-        block = leaves & 0xFFFFFF
-        run = np.int64(first_run[block]) + (leaves >> 24)
+    for node in range(len(child)):
         for slot in range(WIDTH):
-            said = np.int64(SLOT_IS_LEAF | 1 << 21)
-            if (planes[node, INNER] >> slot) & 1:
-                said = child
-                child += 1
-            elif planes[node, LOW + slot] <= planes[node, LOW + 3 * WIDTH + slot]:
-                if node < top_count:
-                    said = top_count + block
-                    block += 1
-                else:
-                    of_run = np.int64(runs[run])
-                    turns = of_run >> 19 & 0xFF | 2 << (of_run >> 8 & 7)
-                    said = SLOT_IS_LEAF | turns << 21 | (of_run >> 27) << 16
-                    said |= (of_run >> 11 & 0xFF) << 8 | of_run & 0xFF
-                    run += 1
+            below = np.int64(child[node, slot])
+            said = below
+            if below == EMPTY:
+                said = np.int64(SLOT_IS_LEAF | 1 << 21)
+            elif below < 0:
+                run = np.int64(runs[-(below + 1)])
+                turns = run >> 19 & 0xFF | 2 << (run >> 8 & 7)
+                said = SLOT_IS_LEAF | turns << 21 | (run >> 27) << 16 | (run >> 11 & 0xFF) << 8 | run & 0xFF
             slots[node, slot] = said
 
 

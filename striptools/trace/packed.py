@@ -9,6 +9,7 @@ import numpy as np
 from striptools.errors import LimitError
 from striptools.hierarchies.packed import BoxGrid
 from striptools.kernels import packed_hits as kernels
+from striptools.kernels.packed_nodes import slot_children
 from striptools.kernels.weighing_double import packed_corners
 from striptools.trace.counters import Counters
 from striptools.trace.layout import Found, PacketView, Rays, blocks_of, packet_view
@@ -153,16 +154,16 @@ def lay_out_packed(scene: "Scene", threads: int = 1) -> PackedLayout:
     exponent = int(np.frexp(scale)[1]) - 1
     faces, rotations = _names(scene, laid)
     nodes, count = laid(packed.nodes), len(packed.nodes)
-    records = nodes.view(np.uint8)
     slots = aligned_zeros((len(nodes), WIDTH), np.uint32)
-    of_nodes = nodes[:count], records[:count], packed.top_count
-    kernels.describe_slots(*of_nodes, packed.first_run, packed.runs, slots[:count])
+    child = np.zeros((count, WIDTH), np.int32)
+    slot_children(packed.nodes, packed.top_count, packed.first_run, child)
+    kernels.describe_slots(child, packed.runs, slots[:count])
     # Classes are of words: few blocks do not take the room of a thousand.
     words = kernels.BLOCK_WORDS * blocks.count
     rows = (words if stored else size_class(words, STEPS)) // kernels.BLOCK_WORDS
     said = aligned_zeros((rows, kernels.BLOCK_WORDS), np.uint32)
     kernels.describe_blocks(blocks.headers, exponent, said)
-    planes = records.reshape(-1, WIDTH, WIDTH)
+    planes = nodes.view(np.uint8).reshape(-1, WIDTH, WIDTH)
     frame = _frame(scene, scale, exponent)
     arrays = PackedScene(nodes, planes, slots, said, laid(blocks.words), faces, frame)
     depth = int(kernels.depth_of(slots[:count]))

@@ -127,12 +127,10 @@ class PackedScene(NamedTuple):
     def boxes_of(self, node: Array) -> Array:
         """(6, 8) float32: the boxes of a node's children, scaled and rounded; NaN in empty lanes."""
         at = index(node)
-        planes = lax.dynamic_slice(self.planes, (at, jnp.uint32(2), jnp.uint32(0)), (1, 6, LANES))[0]
-        head = lax.dynamic_slice(self.nodes, (at, jnp.uint32(0)), (1, 4))[0]
-        origins = jnp.stack([head[2] & 0xFFFF, head[2] >> 16, head[3] & 0xFFFF])
-        shifts = jnp.stack([head[0] >> 28, head[3] >> 24 & 15, head[3] >> 28])
-        cells = origins[:, None] + (planes.reshape(2, 3, LANES).astype(jnp.uint32) << shifts[:, None])
-        boxes = _number(cells) * self.frame.unit[:, None] + self.frame.low[:, None]
+        planes = self._planes_of(at)
+        origins, shifts = (jnp.stack(each) for each in self._grid(self._row(self.nodes, at, 0, 4)))
+        cells = origins[:, None] + (planes.reshape(2, 3, LANES) << shifts[:, None])
+        boxes = cells.astype(jnp.float32) * self.frame.unit[:, None] + self.frame.low[:, None]
         return jnp.where(planes[0] <= planes[3], boxes.reshape(6, LANES), jnp.float32(jnp.nan))
 
     def sides_of(self, node: Array, rows: tuple[Array, ...]) -> list[Array]:
@@ -505,11 +503,6 @@ def _first_by(before: Callable[[int, int], Array]) -> Array:
     """Which corner is the first, by what says whether one comes before another."""
     last = jnp.where(before(1, 0), before(2, 1), before(2, 0))
     return jnp.where(last, 2, jnp.where(before(1, 0), 1, 0))
-
-
-def _number(a: Array) -> Array:
-    """A small unsigned integer as float32, by way of int32: one instruction."""
-    return a.astype(jnp.int32).astype(jnp.float32)
 
 
 def _leading_zeros(a: Array) -> Array:
