@@ -4,8 +4,8 @@ import numpy as np
 
 from striptools.kernels.bits import bits_set, highest_bit
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
-from striptools.kernels.compiled import inlined, kernel
-from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, take_ray, weigh_held
+from striptools.kernels.compiled import fetch, helper, inlined, kernel
+from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, note_hits, take_ray, weigh_held
 from striptools.kernels.wide import EMPTY, LEAST_NORMAL, WIDTH, precedes
 
 SLOT_IS_LEAF = 1 << 31
@@ -176,26 +176,27 @@ def describe_runs(headers, words, first_run, runs, begin, end, described):
 
 @inlined
 def corner_indices(blocks, words, block, t):
-    """The indices of triangle t of a block: SPEC 4.3, alone."""
-    bit = np.int64(blocks[block, HEAD + 1]) << 5
+    """The indices of triangle t of a block: SPEC 4.3, alone, and without branches that go either way."""
+    word = np.int64(blocks[block, HEAD + 1])
     said = np.int64(blocks[block, HEAD + 2])
-    count, width, has_flips = (said & 0xFF) + 1, said >> 8 & 15, said >> 12 & 1
+    bit, count, width, has_flips = word << 5, (said & 0xFF) + 1, said >> 8 & 15, said >> 12 & 1
 
-    # Find the strip, and its first triangle, the last one up to t at which a strip starts.
+    # Count the strips that start up to t: in as many words as the block has, whatever t is.
     strip = np.int64(-1)
-    first = np.int64(0)
-    for k in range(0, t + 1, 32):
-        starts = take(words, bit + k, min(t + 1 - k, 32))
-        strip += bits_set(starts)
-        first = k + highest_bit(starts) if starts != 0 else first
+    for k in range(count + 31 >> 5):
+        ours = (np.int64(1) << min(max(t + 1 - 32 * k, 0), 32)) - 1
+        strip += bits_set(np.int64(words[np.uint64(word + k)]) & ours)
 
-    # Find the last other turn: no more than 30 in a row are equal.
-    begin = max(first + 1, t - 31)
-    size = t + 1 - begin
-    turns = take(words, bit + count + begin, size)
+    # Find its first triangle, and the last other turn behind it; no more than 30 in a row are equal, so that
+    # what is farther back than that does not matter. A one below them stands for none.
+    begin = max(t - 31, 0)
+    starts = take(words, bit + begin, t + 1 - begin)
+    first = begin - 1 + highest_bit(starts << 1 | 1)
+    size = t - first
+    turns = take(words, bit + count + first + 1, size)
     turn = turns >> max(size - 1, 0)
     other = turns ^ ((1 << size) - 1) * turn
-    last = begin + highest_bit(other) if other != 0 else first
+    last = first + highest_bit(other << 1 | 1)
 
     # Take the corners: without branches, which would go astray every other time.
     begin = bit + (2 + has_flips) * count + 2 * strip * width
@@ -243,8 +244,28 @@ def coordinate(number, mode, mask, anchor, exponent):
     return -value if whole < 0 else value
 
 
-@kernel
-def decode_triangles(blocks, words, names, count, places, corners, turns):
+@helper
+def find_corners(blocks, words, names, places):
+    """Find where the corners of up to 64 triangles are, and have their lines fetched.
+
+    Args:
+        blocks: (b, 16) uint32, as from `describe_blocks`.
+        words: (w,) uint32.
+        names: (k,) int32, 256 times a triangle's block plus its number there.
+        places: (3, 64) int64, written: the bits where corners a, b and c begin.
+    """
+    for i in range(len(names)):
+        block = np.int64(names[i] >> 8)
+        a, b, c = corner_indices(blocks, words, block, np.int64(names[i] & 255))
+        begin = (np.int64(blocks[block, HEAD + 1]) << 5) + (np.int64(blocks[block, HEAD + 2]) >> 13)
+        stride = np.int64(blocks[block, HEAD + 3]) & 127
+        places[0, i], places[1, i], places[2, i] = begin + a * stride, begin + b * stride, begin + c * stride
+        for j in range(3):
+            fetch(words, places[j, i] >> 5)
+
+
+@helper
+def decode_corners(blocks, words, names, places, corners, turns):
     """Decode up to 64 triangles, step by step, so that one waits for memory while others do.
 
     Corners are scaled, what is not a normal number then is zero, as the walks have it.
@@ -252,24 +273,13 @@ def decode_triangles(blocks, words, names, count, places, corners, turns):
     Args:
         blocks: (b, 16) uint32, as from `describe_blocks`.
         words: (w,) uint32.
-        names: (64,) int64, 256 times a triangle's block plus its number there.
-        count: How many triangles.
-        places: (3, 64) int64, room.
+        names: (k,) int32, as of `find_corners`.
+        places: (3, 64) int64, as from `find_corners`.
         corners: (9, 64) float32, written: x of corners a, b and c, in the order of the tests, then y, then z.
         turns: (64,) int32, written: the strip's corner that is the first in the order of the tests.
     """
-    # Find where each corner's bits begin.
-    for i in range(count):
-        block = names[i] >> 8
-        a, b, c = corner_indices(blocks, words, block, names[i] & 255)
-        begin = (np.int64(blocks[block, HEAD + 1]) << 5) + (np.int64(blocks[block, HEAD + 2]) >> 13)
-        stride = np.int64(blocks[block, HEAD + 3]) & 127
-        places[0, i] = begin + a * stride
-        places[1, i] = begin + b * stride
-        places[2, i] = begin + c * stride
-
     # Take them.
-    for i in range(count):
+    for i in range(len(names)):
         block = names[i] >> 8
         for axis in range(3):
             anchor = np.int64(np.int32(blocks[block, 4 * axis]))
@@ -329,7 +339,7 @@ def weigh_packed_hits(
     v,
     triangle,
 ):
-    """Where on its face each hit lies: only the triangles hit are decoded.
+    """Where on its face each hit lies: only the triangles hit are decoded. Nothing is written of other rays.
 
     Args:
         origins: (r, 3) float32.
@@ -346,49 +356,51 @@ def weigh_packed_hits(
         face: (r,) int32, written.
         u: (r,) float32, written: the weight of the face's second corner; (0,) where no weights are wanted.
         v: (r,) float32, written: the weight of its third corner; or (0,).
-        triangle: (r,) int32, written; -1 on a miss.
+        triangle: (r,) int32, written.
     """
-    weighed = len(u) > 0
+    rays, names = note_hits(at, found_t, found, t)
+    for i in range(len(rays)):
+        r, name = rays[i], names[i]
+        number = np.int64(blocks[name >> 8, HEAD]) + (name & 255)
+        triangle[r] = number
+        face[r] = faces[number] if len(faces) > 0 else number
+    if len(u) == 0 or len(rays) == 0:
+        return
+
+    # A triangle that was hit just before is decoded once.
+    slots = np.empty(len(rays), np.int32)
+    slots[0] = 0
+    for i in range(1, len(rays)):
+        slots[i] = slots[i - 1] + (names[i] != names[i - 1])
+    for i in range(len(rays)):
+        names[slots[i]] = names[i]
+    names = names[: slots[-1] + 1]
+
+    # Decode a chunk of triangles while the next one's lines are fetched; a chunk of hits needs two at most.
     room = np.zeros(ROOM, np.float32)
-    corners = np.zeros((9, CHUNK), np.float32)
-    places = np.zeros((3, CHUNK), np.int64)
-    names = np.zeros(CHUNK, np.int64)
-    turns = np.zeros(CHUNK, np.int32)
-    ray_of = np.zeros(CHUNK, np.int32)
-    slot_of = np.zeros(CHUNK, np.int32)
+    corners = np.zeros((2, 9, CHUNK), np.float32)
+    places = np.zeros((2, 3, CHUNK), np.int64)
+    turns = np.zeros((2, CHUNK), np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
-    held, distinct = 0, 0
-    for k in range(len(at)):
-        r = at[k]
-        if r >= 0:
-            t[r] = found_t[k]
-            name = np.int64(found[k])
-            number = np.int64(-1)
-            face[r] = found[k]
-            if name >= 0:
-                number = np.int64(blocks[name >> 8, HEAD]) + (name & 255)
-                face[r] = faces[number] if len(faces) > 0 else number
-            triangle[r] = number
-            if weighed and name < 0:
-                u[r] = 0.0
-                v[r] = 0.0
-            elif weighed:
-                # A triangle that was hit just before is decoded once.
-                distinct += 1 if held == 0 or names[max(distinct - 1, 0)] != name else 0
-                names[distinct - 1] = name
-                slot_of[held] = distinct - 1
-                ray_of[held] = r
-                held += 1
-        if held == CHUNK or (held > 0 and k == len(at) - 1):
-            decode_triangles(blocks, words, names, distinct, places, corners, turns)
-            for i in range(held):
-                r, slot = ray_of[i], slot_of[i]
-                axes = take_ray(origins, directions, r, room, i)
-                for axis in range(3):
-                    for j in range(3):
-                        room[CORNERS + (3 * axis + j) * CHUNK + i] = corners[3 * axes[axis] + j, slot]
-                # Name its corners as the reported face does.
-                rotation = rotations[triangle[r]] if len(rotations) > 0 else 0
-                turn_of[i] = (turns[slot] + rotation) % 3
-            weigh_held(room, held, scale, ray_of, turn_of, u, v)
-            held, distinct = 0, 0
+    decoded = 0
+    find_corners(blocks, words, names[:CHUNK], places[0])
+    for begin in range(0, len(rays), CHUNK):
+        end = min(begin + CHUNK, len(rays))
+        while decoded <= slots[end - 1]:
+            behind = decoded + CHUNK
+            here, there = decoded // CHUNK & 1, behind // CHUNK & 1
+            find_corners(blocks, words, names[behind : behind + CHUNK], places[there])
+            wanted = names[decoded:behind]
+            decode_corners(blocks, words, wanted, places[here], corners[here], turns[here])
+            decoded = behind
+        for i in range(end - begin):
+            r, slot = rays[begin + i], slots[begin + i]
+            half, column = slot // CHUNK & 1, slot % CHUNK
+            axes = take_ray(origins, directions, r, room, i)
+            for axis in range(3):
+                for j in range(3):
+                    room[CORNERS + (3 * axis + j) * CHUNK + i] = corners[half, 3 * axes[axis] + j, column]
+            # Name its corners as the reported face does.
+            rotation = rotations[triangle[r]] if len(rotations) > 0 else 0
+            turn_of[i] = (turns[half, column] + rotation) % 3
+        weigh_held(room, end - begin, scale, rays[begin:end], turn_of, u, v)

@@ -125,21 +125,18 @@ def gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, roo
 
 
 @maker
-def note_hits(at, found_t, found_face, triangle_of, t, face, triangle):
-    """Write t, face and triangle of rays that hit something; return these rays and the faces, (h,) int32."""
+def note_hits(at, found_t, found, t):
+    """Write t of rays that hit something; return these rays and the names of what they hit, (h,) int32."""
     rays, names = np.empty(len(at), np.int32), np.empty(len(at), np.int32)
     held = 0
     for k in range(len(at)):
         # Without a branch, which would go astray: whether a ray hits anything is hard to foresee.
         rays[held] = k
-        held += np.int64((at[k] >= 0) & (found_face[k] >= 0))
+        held += np.int64((at[k] >= 0) & (found[k] >= 0))
     for i in range(held):
         k = rays[i]
-        r, name = at[k], found_face[k]
-        rays[i], names[i] = r, name
-        t[r] = found_t[k]
-        face[r] = name
-        triangle[r] = triangle_of[name] if len(triangle_of) > 0 else name
+        rays[i], names[i] = at[k], found[k]
+        t[at[k]] = found_t[k]
     return rays[:held], names[:held]
 
 
@@ -165,7 +162,10 @@ def weigh_hits(
         v: (r,) float32, written: the weight of its third corner; or (0,).
         triangle: (r,) int32, written.
     """
-    rays, names = note_hits(at, found_t, found_face, triangle_of, t, face, triangle)
+    rays, names = note_hits(at, found_t, found_face, t)
+    for i in range(len(rays)):
+        face[rays[i]] = names[i]
+        triangle[rays[i]] = triangle_of[names[i]] if len(triangle_of) > 0 else names[i]
     if len(u) == 0:
         return
     room = np.zeros(ROOM, np.float32)

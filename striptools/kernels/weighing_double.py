@@ -3,7 +3,7 @@
 import numpy as np
 
 from striptools.kernels.compiled import kernel
-from striptools.kernels.packed_hits import HEAD, decode_triangles
+from striptools.kernels.packed_hits import HEAD, decode_corners, find_corners
 from striptools.kernels.rays import longest_axis
 from striptools.kernels.weighing import CHUNK
 from striptools.kernels.wide import flushed
@@ -42,13 +42,12 @@ def packed_corners(names, blocks, words, rotations, corners, turns):
     """
     decoded = np.zeros((9, CHUNK), np.float32)
     places = np.zeros((3, CHUNK), np.int64)
-    wanted = np.zeros(CHUNK, np.int64)
     turned = np.zeros(CHUNK, np.int32)
     for begin in range(0, len(names), CHUNK):
-        count = min(CHUNK, len(names) - begin)
-        wanted[:count] = names[begin : begin + count]
-        decode_triangles(blocks, words, wanted, count, places, decoded, turned)
-        for i in range(count):
+        wanted = names[begin : begin + CHUNK]
+        find_corners(blocks, words, wanted, places)
+        decode_corners(blocks, words, wanted, places, decoded, turned)
+        for i in range(len(wanted)):
             for row in range(9):
                 corners[begin + i, row // 3, row % 3] = decoded[row, i]
             number = np.int64(blocks[wanted[i] >> 8, HEAD]) + (wanted[i] & 255)
