@@ -10,7 +10,6 @@ Cost: a third of that of one ray after the other.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.bits import highest_bit
 from striptools.kernels.compiled import fetch, inlined
 from striptools.kernels.wide import BROAD, EMPTY
 
@@ -24,9 +23,8 @@ SLAB, START, SHEAR, REACH, AXES = 0, 9 * CHUNK, 12 * CHUNK, 15 * CHUNK, 17 * CHU
 OCTANT, CHILD, LANES, VISITED = 20 * CHUNK, 21 * CHUNK, 22 * CHUNK, 23 * CHUNK
 """Where in a chunk the words of ready rays are, a row of 64 each, in the order of `ReadyRay`."""
 
-WAY, VALID = 24 * CHUNK, 27 * CHUNK
-"""Three more rows for directions, as given and then along the axes; and one that is zero where there is no
-ray."""
+WAY, STATE = 24 * CHUNK, 27 * CHUNK
+"""Three more rows for directions, as given and then along the axes; and one for what is told as `dropped`."""
 
 ROOM = 28 * CHUNK
 
@@ -141,7 +139,7 @@ def prepare_chunk(room, frame):
     unit_x, unit_y, unit_z = unit[0], unit[1], unit[2]
     for i in range(CHUNK):
         ox, oy, oz, dx, dy, dz, far, back, valid = scaled_ray(room, START, WAY, REACH, CHUNK, i, scale)
-        room[VALID + i] = ONE if valid else ZERO
+        room[STATE + i] = as_word(0 if valid else 2)
         room[REACH + i] = far
         room[REACH + CHUNK + i] = back
 
@@ -182,13 +180,13 @@ def prepare_chunk(room, frame):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def visit_root(room, root):
-    """Write the root's lanes that each ray of a chunk meets, as bits in the order of visits, nearest highest.
+    """Write what each ray of a chunk finds at the root: its nearest child's lane, and those left.
 
     Args:
-        room: (1792,) float32, of prepared rays.
+        room: (1792,) float32, of prepared rays; bits of the lanes left are in the order of visits, nearest
+            highest.
         root: (>= 6, k) float32, as of `ready_rays`.
     """
-    broad = root.shape[1] == BROAD
     for i in range(CHUNK):
         room[LANES + i] = as_word(0)
     for lane in range(root.shape[1]):
@@ -196,6 +194,7 @@ def visit_root(room, root):
         x1, y1, z1 = root[3, lane], root[4, lane], root[5, lane]
         if np.isnan(x0):
             continue
+        bit = np.int32(1 << lane)
         for i in range(CHUNK):
             ix, iy, iz = room[SLAB + 6 * CHUNK + i], room[SLAB + 7 * CHUNK + i], room[SLAB + 8 * CHUNK + i]
             ax = x0 * ix - room[SLAB + i]
@@ -207,9 +206,31 @@ def visit_root(room, root):
             limit = room[REACH + i] * SLACK
             entry = larger(larger(smaller(ax, bx), smaller(ay, by)), larger(smaller(az, bz), ZERO))
             leaving = smaller(larger(ax, bx), smaller(larger(ay, by), larger(az, bz))) * FAR_FACTOR
-            bit = np.int32(1) << (np.int32(lane) ^ mirror_of(bits_of(room[OCTANT + i]), broad))
             met = bit if entry <= smaller(limit, leaving) else np.int32(0)
             room[LANES + i] = as_word(bits_of(room[LANES + i]) | met)
+
+    # A shift by other numbers for each ray would be of 64 bits: lanes are put in order by exchanging them.
+    broad = root.shape[1] == BROAD
+    for i in range(CHUNK):
+        mirror = mirror_of(bits_of(room[OCTANT + i]), broad)
+        met = bits_of(room[LANES + i])
+        met = exchanged(met, mirror & 1, 1, 0x5555)
+        met = exchanged(met, mirror & 2, 2, 0x3333)
+        met = exchanged(met, mirror & 4, 4, 0x0F0F)
+        met = exchanged(met, mirror & 8, 8, 0x00FF)
+        # The highest bit is the exponent of the same number as a float.
+        exponent = bits_of(np.float32(np.int32(met))) & 0x7F800000
+        room[CHILD + i] = as_word((exponent >> 23) - 127 ^ mirror)
+        room[LANES + i] = as_word(met - np.int32(as_word(exponent)))
+        state = bits_of(room[STATE + i])
+        room[STATE + i] = as_word(1 if (state == 0) & (met == 0) else state)
+        room[VISITED + i] = as_word(1)
+
+
+@inlined
+def exchanged(bits, swap, distance, low):
+    """Bits, those at `low` places exchanged with those at a distance above them where `swap` is not zero."""
+    return (bits & low) << distance | bits >> distance & low if swap else bits
 
 
 @inlined
@@ -269,7 +290,7 @@ def ready_rays(
         The number of rows written, and the first of the rays that was not taken.
     """
     room = np.zeros(ROOM, np.float32)
-    broad = len(children) == BROAD
+    live = np.zeros(CHUNK, np.int64)
     every = len(which) if len(which) > 0 else len(origins)
     count, place = 0, begin
     while place < every and count < len(rays):
@@ -278,29 +299,27 @@ def ready_rays(
         prepare_chunk(room, frame)
         if visit:
             visit_root(room, root)
+        else:
+            room[CHILD : CHILD + 3 * CHUNK] = ZERO
+
+        # Tell what becomes of each, without a branch: that goes either way.
+        alive = 0
         for i in range(held):
-            r = ray_at(which, place + i)
-            lanes = bits_of(room[LANES + i])
-            child = np.int32(0)
-            if room[VALID + i] == ZERO:
-                dropped[r] = 2
-                continue
-            if visit:
-                if lanes == 0:
-                    dropped[r] = 1
-                    continue
-                order = highest_bit(lanes)
-                child = children[order ^ mirror_of(bits_of(room[OCTANT + i]), broad)]
-                lanes ^= np.int32(1) << order
-            dropped[r] = 0
-            for word in range(CHILD // CHUNK):
-                rays[count, word] = room[word * CHUNK + i]
-            words[count, CHILD // CHUNK] = child ^ EMPTY
-            words[count, LANES // CHUNK] = lanes
-            words[count, VISITED // CHUNK] = 1 if visit else 0
+            state = bits_of(room[STATE + i])
+            dropped[ray_at(which, place + i)] = state
+            live[alive] = i
+            alive += np.int64(state == 0)
+
+        # Write those that have something to visit.
+        for k in range(alive):
+            i, row = live[k], np.uint64(count + k)
+            at[row] = ray_at(which, place + i)
+            for word in range(ROW):
+                rays[row, np.uint64(word)] = room[np.uint64(word * CHUNK + i)]
+            child = children[bits_of(room[CHILD + i])] if visit else np.int32(0)
+            words[row, np.uint64(CHILD // CHUNK)] = child ^ EMPTY
             for word in range(ROW, rays.shape[1]):
-                rays[count, word] = room[word * CHUNK + i]
-            at[count] = r
-            count += 1
+                rays[row, np.uint64(word)] = room[np.uint64(word * CHUNK + i)]
+        count += alive
         place += held
     return count, place
