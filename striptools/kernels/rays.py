@@ -10,7 +10,7 @@ Cost: a third of that of one ray after the other.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import fetch, inlined
+from striptools.kernels.compiled import fetch, inlined, kernel
 from striptools.kernels.wide import BROAD, EMPTY
 
 ROW = 24
@@ -35,6 +35,12 @@ LEAST_NORMAL = np.float32(np.finfo(np.float32).tiny)
 FAR_FACTOR = np.float32(1 + 2**-21)
 TINY = np.float32(2**-60)
 SLACK = np.float32(1 + 2**-20)
+
+
+@kernel
+def room_of(length):
+    """(length,) uint8, not written, where zeros would be written for each call that traces."""
+    return np.empty(length, np.uint8)
 
 
 @inlined

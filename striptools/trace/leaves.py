@@ -1,7 +1,8 @@
 """A scene laid out for the walk, expanded: wide nodes, leaf blocks, and the way from a face to its place."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -288,7 +289,14 @@ def aligned_full(shape: tuple[int, ...], value: float) -> np.ndarray:
 
 def aligned_zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
     """An array of zeros that starts at a cache line."""
+    return aligned(partial(np.zeros, dtype=np.uint8), shape, dtype)
+
+
+def aligned(
+    room: Callable[[int], np.ndarray], shape: tuple[int, ...], dtype: type[np.generic]
+) -> np.ndarray:
+    """An array that starts at a cache line, in whatever room for so many bytes has."""
     length = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    memory = np.zeros(length + CACHE_LINE, np.uint8)
+    memory = room(length + CACHE_LINE)
     start = -memory.ctypes.data % CACHE_LINE
     return memory[start : start + length].view(dtype).reshape(shape)

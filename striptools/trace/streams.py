@@ -19,12 +19,12 @@ from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.pictures import row_width, tile_order
 from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
-from striptools.kernels.rays import ROW, ready_rays
+from striptools.kernels.rays import ROW, ready_rays, room_of
 from striptools.threads import at_once
 from striptools.trace.device import quiet_jax
 from striptools.trace.launch import TILES, device_mesh, program
 from striptools.trace.layout import Layout, Rays
-from striptools.trace.leaves import aligned_zeros
+from striptools.trace.leaves import aligned
 from striptools.trace.triangle_tests import wants_way
 from striptools.trace.walk import WalkOptions, WalkScene
 
@@ -258,7 +258,8 @@ class _Pipe:
             yield self._collect()
 
     def _new(self) -> _Buffers:
-        rows = aligned_zeros(self._shape, np.float32)
+        # What is not filled is never read.
+        rows = aligned(room_of, self._shape, np.float32)
         return _Buffers(rows, np.zeros((len(rows), *self._lanes), np.int32))
 
     def _send(self) -> Parts:
