@@ -314,7 +314,7 @@ def ready_rays(
             state = bits_of(room[STATE + i])
             dropped[ray_at(which, place + i)] = state
             live[alive] = i
-            alive += np.int64(state == 0)
+            alive += 1 if state == 0 else 0
 
         # Write those that have something to visit.
         for k in range(alive):

@@ -292,9 +292,7 @@ def aligned_zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray
     return aligned(partial(np.zeros, dtype=np.uint8), shape, dtype)
 
 
-def aligned(
-    room: Callable[[int], np.ndarray], shape: tuple[int, ...], dtype: type[np.generic]
-) -> np.ndarray:
+def aligned(room: Callable[[int], np.ndarray], shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
     """An array that starts at a cache line, in whatever room for so many bytes has."""
     length = int(np.prod(shape)) * np.dtype(dtype).itemsize
     memory = room(length + CACHE_LINE)
