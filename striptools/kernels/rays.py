@@ -321,11 +321,11 @@ def ready_rays(
             i, row = live[k], np.uint64(count + k)
             at[row] = ray_at(which, place + i)
             for word in range(ROW):
-                rays[row, np.uint64(word)] = room[np.uint64(word * CHUNK + i)]
+                rays[row, word] = room[np.uint64(word * CHUNK + i)]
             child = children[bits_of(room[CHILD + i])] if visit else np.int32(0)
-            words[row, np.uint64(CHILD // CHUNK)] = child ^ EMPTY
+            words[row, CHILD // CHUNK] = child ^ EMPTY
             for word in range(ROW, rays.shape[1]):
-                rays[row, np.uint64(word)] = room[np.uint64(word * CHUNK + i)]
+                rays[row, word] = room[np.uint64(word * CHUNK + i)]
         count += alive
         place += held
     return count, place
