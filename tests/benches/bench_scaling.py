@@ -6,7 +6,9 @@ One core is all threads of the process pinned to the first core and one device; 
 no pins. One device beside a free core is measured too: the tracer's host kernels then have that core. Other
 programs may run on the machine, so a time counts only where a loop that does nothing but compute ran on two
 threads in the least time of one, right before and right after (`QUIET`), and is taken only once nothing else
-has run for a moment; what is compared are least times. `--everything` counts all. Linux only.
+has run for a moment; what is compared are least times. Where the machine is never that quiet, `--everything`
+counts all: what is compared are medians, and beside them stands what two cores gave that loop in the same
+moments, which is as much as the tracer can gain. Linux only.
 """
 
 import argparse
@@ -16,6 +18,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from cores import pin
@@ -78,17 +81,16 @@ def measure(name: str, scene: Scene, side: int, seconds: float, quiet: float) ->
     ):
         for query in ("closest_hit", "any_hit"):
             calls = [partial(getattr(tracer, query), *rays, packets=packets) for tracer in (one, two)]
-            pinned, beside, both, turns = by_turns(calls[0], calls[1], seconds, quiet)
+            found = by_turns(calls[0], calls[1], seconds, quiet)
             what = f"{kind}, {query.replace('_', ' ')}"
-            said = f"{len(rays[0])} rays, {turns} times each"
-            if turns:
-                note = f"{said}; one device beside a free core {beside / both:.3g}"
-                row = Row(
-                    "scaling", name, scene.triangle_count, what, pinned / both, "of one core", note=note
-                )
-                rows.append(row)
-                said = f"{pinned / both:.3f} of one core, {beside / both:.3f} of one device ({said})"
-            sys.stdout.write(f"{name}: {what}: {said}, {1000 * both:.0f} ms\n")
+            said = f"{len(rays[0])} rays, {found.turns} times each"
+            if found.turns:
+                gain, beside = found.pinned / found.both, found.beside / found.both
+                said += f"; one device beside a free core {beside:.3g}"
+                said += f"; a loop that only computes {found.loop:.3g}"
+                rows.append(Row("scaling", name, scene.triangle_count, what, gain, "of one core", note=said))
+                said = f"{gain:.3f} of one core ({said}), {1000 * found.both:.0f} ms"
+            sys.stdout.write(f"{name}: {what}: {said}\n")
             sys.stdout.flush()
     return rows
 
@@ -108,28 +110,46 @@ def bounced(
     return cosine_rays(points, normals, seed=1, offset=1e-5 * float(np.linalg.norm(scene.high - scene.low)))
 
 
-def by_turns(one: Call, two: Call, seconds: float, quiet: float) -> tuple[float, float, float, int]:
-    """Least seconds of one pinned, one beside a free core, and two; and how often the rarest counted."""
+class Found(NamedTuple):
+    """Seconds of a call on one core, on one device beside a free core and on two devices; how often the
+    rarest counted; and how much faster than on one core the loop ran on two.
+    """
+
+    pinned: float
+    beside: float
+    both: float
+    turns: int
+    loop: float
+
+
+def by_turns(one: Call, two: Call, seconds: float, quiet: float) -> Found:
+    """Least times of what counts, or medians where all does."""
     ways = ((one, {0}), (one, {0, 1}), (two, {0, 1}))
     times: list[list[float]] = [[] for _ in ways]
+    loops: list[float] = []
     one()
     two()
-    alone = min(timed(spin) for _ in range(30))
+    least = min(timed(spin) for _ in range(30))
     end, turn = time.perf_counter() + seconds, 0
     while time.perf_counter() < end and min(map(len, times)) < ENOUGH:
         await_quiet(end if quiet < np.inf else 0.0)
         call, cores = ways[turn % len(ways)]
-        alone = min(alone, timed(spin))
-        before = together() / alone
+        alone = timed(spin)
+        least = min(least, alone)
+        before = together()
         pin(cores)
         spent = timed(call)
         pin({0, 1})
         after = together()
-        if max(before, after / alone) <= quiet:
+        if max(before, after) <= quiet * least:
             times[turn % len(ways)].append(spent)
+            loops.append(2 * alone / before)
         turn += 1
-    pinned, beside, both = (min(each, default=np.inf) for each in times)
-    return pinned, beside, both, min(map(len, times))
+    turns = min(map(len, times))
+    if turns == 0:
+        return Found(np.inf, np.inf, np.inf, 0, np.nan)
+    pinned, beside, both = (float(np.median(each)) if quiet == np.inf else min(each) for each in times)
+    return Found(pinned, beside, both, turns, float(np.median(loops)))
 
 
 def await_quiet(end: float) -> None:
