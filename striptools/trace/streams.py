@@ -318,3 +318,11 @@ class _Pipe:
 # it writes, 96 bytes each. Tiles of 2**14 rays, which lie in the cache, 0.96 to 0.98 all the same, of 2**13
 # 0.95. No gain: a t_max for all kept once, results filled by bytes. Room for rows not zeroed saves 4 to 5.
 # Of a packet's loop 4 ns a ray go to buffers that XLA fills before a scan writes them, as `lax.empty` does.
+#
+# Not worth it (bunny, dragon; a machine with other work). Ready rays in chunks of 64, a row a word, so that
+# they are written whole registers at a time: 0.9 to 1.0, as what a row costs is the way through memory, not
+# the writing. Rays made ready in the walk's own program, 64 at a time, with no rows at all (a third less code
+# on this side; lanes with something to visit are bits of one number): the same hits, 0.98 to 1.03, and a
+# second more to compile, as XLA unrolls each of 24 loops of 64. Programs called synchronously (no thread is
+# woken) with tiles of 2**13 to 2**15 rays, or of 2**16: 0.92 to 1.0, 1.0. A call takes 30 to 110 us, and one
+# with 2**13 rays 2 ms.

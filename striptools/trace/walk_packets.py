@@ -439,3 +439,6 @@ def _walk_packet(
 # Rays read where all packets lie gave 1.03 (bunny, dragon): a row is copied number by number. No gain: hits
 # and misses written in one pass, not misses beforehand, 0.92 to 1.0; the limit by a largest integer, which
 # LLVM finds step by step too, 1.0.
+#
+# Weights of hits worked out where triangles are tested, and carried along, so that the host need not read
+# leaves again (a tenth of a camera's time; the same bits): 0.74 to 0.81 expanded, 0.94 to 0.99 compressed.
