@@ -35,7 +35,8 @@ import jax
 import numpy as np
 from leak_rays import RUN, Place, Rays, Target, Verdict, from_inside, from_outside, judge
 from leak_shapes import closed_shapes
-from leak_walks import LEAKY, MAIN, OTHERS, SHARED, Traces, Walk, peers
+from leak_walks import LEAKY, MAIN, OTHERS, SHARED, Traces, Walk
+from peers import peers
 from results import Row, append
 
 import striptools
@@ -369,9 +370,9 @@ def placed_rays(rays: Rays, targets: np.ndarray, matrix: np.ndarray, *, exact: b
 def trace_peers(table: Table, spot: Place, target: Target, batches: list[Batch]) -> None:
     """Count the leaks of the peers that are installed."""
     corners = target.mesh.positions[target.mesh.faces[target.kept]]
-    for name, closest in peers(corners):
+    for name, peer in peers(corners):
         for batch in batches:
-            t = closest(batch.rays.origins, batch.rays.directions)
+            t = peer.distances(batch.rays.origins, batch.rays.directions)
             length = np.linalg.norm(batch.rays.directions.astype(np.float64), axis=1)
             leaks = batch.verdict.leaks(t, PEER_SLACK * target.diagonal / length)
             for where in ("", ", as it lies") if spot == Place() else ("",):

@@ -22,14 +22,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from cores import pin
-from embreex import rtcore, rtcore_scene
-from embreex.mesh_construction import TriangleMesh
+from peers import PEERS
 from results import Row, append
 
 import striptools
@@ -51,52 +48,8 @@ BENCH = {
 PIXELS = 1024
 TILE = 8
 RANDOM = 2**18
-FAR = np.float32(1e37)
 
 Rays = tuple[np.ndarray, np.ndarray]
-
-
-class Embree:
-    """The peer: embreex as it comes, its default scene, through its Python interface."""
-
-    def __init__(self, corners: np.ndarray) -> None:
-        self.device = rtcore.EmbreeDevice()
-        self.scene = rtcore_scene.EmbreeScene(self.device)
-        self.mesh = TriangleMesh(self.scene, corners)
-        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-
-    def closest(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The face that each ray hits first, -1 for none."""
-        far = np.full(len(origins), FAR)
-        return self.scene.run(origins, directions, dists=far, query="INTERSECT")
-
-    def any(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether each ray hits anything."""
-        far = np.full(len(origins), FAR)
-        return self.scene.run(origins, directions, dists=far, query="OCCLUDED") == 0
-
-
-class Open3D:
-    """The peer: Open3D's scene for casting rays, which is Embree inside, on one thread."""
-
-    def __init__(self, corners: np.ndarray) -> None:
-        open3d: Any = import_module("open3d")
-        self.tensor = open3d.core.Tensor
-        self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        indices = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
-        vertices = np.ascontiguousarray(corners.reshape(-1, 3))
-        self.scene.add_triangles(self.tensor(vertices), self.tensor(indices))
-        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-
-    def closest(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The face that each ray hits first, -1 for none."""
-        rays = self.tensor(np.concatenate([origins, directions], axis=1))
-        return self.scene.cast_rays(rays, nthreads=1)["primitive_ids"].numpy().view(np.int32)
-
-    def any(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether each ray hits anything."""
-        rays = self.tensor(np.concatenate([origins, directions], axis=1))
-        return self.scene.test_occlusions(rays, nthreads=1).numpy()
 
 
 def main() -> int:
@@ -143,7 +96,7 @@ def measure(
     rows: list[Row] = []
     camera, anywhere = tiled_camera_rays(scene), random_rays(scene, RANDOM)
     occlusion: Rays | None = None
-    for peer_name, make in (("embreex", Embree), ("open3d", Open3D)):
+    for peer_name, make in PEERS:
         start = time.perf_counter()
         try:
             peer = make(corners)
@@ -153,14 +106,14 @@ def measure(
         given = "trace", name, count, "tracer build", build, "s", peer_name, peer_build
         rows.append(Row(*given, build / peer_build, note))
         if occlusion is None:
-            occlusion = occlusion_rays(corners, camera, peer.closest(*camera))
+            occlusion = occlusion_rays(corners, camera, peer.faces(*camera))
         for metric, rays, call, other in (
-            ("camera rays, closest hit", camera, "closest", peer.closest),
-            ("AO rays, closest hit", occlusion, "closest", peer.closest),
-            ("camera rays, closest hit without weights", camera, "faces", peer.closest),
-            ("AO rays, closest hit without weights", occlusion, "faces", peer.closest),
+            ("camera rays, closest hit", camera, "closest", peer.faces),
+            ("AO rays, closest hit", occlusion, "closest", peer.faces),
+            ("camera rays, closest hit without weights", camera, "faces", peer.faces),
+            ("AO rays, closest hit without weights", occlusion, "faces", peer.faces),
             ("AO rays, any hit", occlusion, "any", peer.any),
-            ("random rays, closest hit", (anywhere.origins, anywhere.directions), "closest", peer.closest),
+            ("random rays, closest hit", (anywhere.origins, anywhere.directions), "closest", peer.faces),
         ):
             found = _compare(name, count, metric, rays, asked(tracer, call), other, repeats, note)
             rows.append(replace(found, peer=peer_name))

@@ -1,11 +1,9 @@
-"""The walks and the peers that the leak table is of."""
+"""The walks that the leak table is of."""
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
-from typing import Any, Protocol, get_args
+from typing import Protocol, get_args
 
 import numpy as np
 from leak_gpu import GpuWalk
@@ -138,45 +136,3 @@ OTHERS = (
 
 SHARED = RESIDENT
 """How instances are shared."""
-
-Peer = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From origins and directions to t, infinite on a miss."""
-
-
-def peers(corners: np.ndarray) -> Iterator[tuple[str, Peer]]:
-    """Each peer that is installed, with the triangles (n, 3, 3) float32 taken in."""
-    for name, make in (("embreex", _embreex), ("open3d", _open3d)):
-        with suppress(ImportError):
-            yield name, make(corners)
-
-
-def _embreex(corners: np.ndarray) -> Peer:
-    rtcore: Any = import_module("embreex.rtcore")
-    scenes: Any = import_module("embreex.rtcore_scene")
-    meshes: Any = import_module("embreex.mesh_construction")
-    device = rtcore.EmbreeDevice()
-    scene = scenes.EmbreeScene(device)
-    kept = [device, meshes.TriangleMesh(scene, corners)]
-
-    def closest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        # Embree's objects live as long as this function.
-        _ = kept
-        far = np.full(len(origins), np.float32(1e37))
-        found = scene.run(origins, directions, dists=far, output=True)
-        return np.where(found["primID"] >= 0, found["tfar"], np.float32(np.inf))
-
-    return closest
-
-
-def _open3d(corners: np.ndarray) -> Peer:
-    open3d: Any = import_module("open3d")
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    indices = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
-    tensor = open3d.core.Tensor
-    scene.add_triangles(tensor(np.ascontiguousarray(corners.reshape(-1, 3))), tensor(indices))
-
-    def closest(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        rays = np.concatenate([origins, directions], axis=1)
-        return scene.cast_rays(tensor(rays))["t_hit"].numpy()
-
-    return closest
