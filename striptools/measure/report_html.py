@@ -11,7 +11,7 @@ from pathlib import Path
 from striptools.choose import BASELINE
 from striptools.measure.trade import Point, Trade, picture_name
 from striptools.measure.trade_targets import chosen_of
-from striptools.mesh.simplify import LEAST_TRIANGLES, reaches
+from striptools.mesh.simplify import reaches, wanted_of
 
 COLUMNS = {
     "name": "point",
@@ -115,9 +115,7 @@ def shortfalls(trade: Trade) -> list[str]:
     asked: dict[tuple[str, int], list[str]] = {}
     for point in trade.points:
         share = re.search(r"([\d.]+)%$", point.value)
-        if share and not reaches(
-            point.triangles, max(LEAST_TRIANGLES, float(share[1]) / 100 * trade.triangles)
-        ):
+        if share and not reaches(point.triangles, wanted_of(trade.triangles, float(share[1]) / 100)):
             asked.setdefault((point.factor, point.triangles), []).append(point.value)
     return [
         f"not reached: {factor}: {'; '.join(values)}: {left / trade.triangles:.0%} of the triangles are "

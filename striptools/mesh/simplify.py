@@ -144,7 +144,7 @@ def simplify(mesh: Mesh, options: SimplifyOptions, *, threads: int | None = None
         largest *= float(np.linalg.norm(whole.bounds[1] - whole.bounds[0]))
     if options.keep is not None:
         result = _measured(whole, surface, collapsed(whole, options.keep), None, threads)
-        result = replace(result, wanted=_wanted(whole, options.keep))
+        result = replace(result, wanted=wanted_of(whole.triangle_count, options.keep))
         if largest is not None and result.error_bound > largest:
             raise UsageError(
                 f"{result.mesh.triangle_count:,} triangles stray by up to {result.error_bound:.4g}, "
@@ -210,7 +210,7 @@ def collapsed(whole: Mesh, keep: float) -> Mesh | None:
         raise MissingExtraError(
             "simplifying needs fast-simplification", remedy='pip install "striptools[simplify]"'
         ) from error
-    wanted = _wanted(whole, keep)
+    wanted = wanted_of(whole.triangle_count, keep)
     if wanted >= whole.triangle_count:
         return whole
     best = None
@@ -225,8 +225,9 @@ def collapsed(whole: Mesh, keep: float) -> Mesh | None:
     return best
 
 
-def _wanted(whole: Mesh, keep: float) -> int:
-    return max(LEAST_TRIANGLES, round(keep * whole.triangle_count))
+def wanted_of(triangles: int, keep: float) -> int:
+    """How many of the triangles a share of them is, at least so many as simplifying leaves."""
+    return max(LEAST_TRIANGLES, round(keep * triangles))
 
 
 def reaches(triangles: int, wanted: float) -> bool:

@@ -56,7 +56,6 @@ from striptools.trace.numerics import in_range, index, larger, power_of_two_belo
 from striptools.trace.standing import Places, Standing, standing
 from striptools.trace.triangle import Shear
 from striptools.trace.walk import (
-    DONE,
     FLOATS,
     MISS,
     STUCK,
@@ -70,6 +69,7 @@ from striptools.trace.walk import (
     WalkOptions,
     found_alone,
     largest_of,
+    names_leaf,
     prepared_ray,
     prepared_rays,
     scaled_ray,
@@ -281,7 +281,7 @@ class _Seen(NamedTuple):
         """Walk the geometry of an instance."""
         number = -(where + 1)
         # A GPU goes through the motions for rays that are at no leaf.
-        there = (where < 0) & (where != DONE)
+        there = names_leaf(where)
         limit = jnp.where(there, best.limit, 0)
         if self.in_place:
             seen, row = self._standing_at(index(number), limit, ray.shear)

@@ -28,7 +28,7 @@ from jax import Array, lax
 
 from striptools.trace.numerics import folded, index, larger, rounded, smaller
 from striptools.trace.triangle import pick
-from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, Decode, Frame, Leaf, WalkScene
+from striptools.trace.walk import DONE, MISS, NO_NAME, STUCK, Decode, Frame, Leaf, WalkScene, names_leaf
 
 FARTHEST = np.float32(2.0**60)
 """The largest scaled coordinate of a point that can be looked from: squares stay finite."""
@@ -183,7 +183,7 @@ def _turn(search: Search, state: Searched) -> Searched:
     # Where there is no child that is a node this writes above the stack's top, where nothing is.
     above = index(jnp.where(child >= 0, state.height, len(stack) - 1))
     stack = lax.dynamic_update_slice(stack, below[None], (above, jnp.uint32(0)))
-    at_leaf = (child < 0) & (child != DONE)
+    at_leaf = names_leaf(child)
     where = scene.find_leaf(child)
     nearest = lax.cond(at_leaf, lambda: search.visit(where, state.nearest), lambda: state.nearest)
     return Searched(stack, height, state.turns + 1, nearest)

@@ -31,7 +31,7 @@ from jax import Array
 
 from striptools.trace.numerics import index, larger
 from striptools.trace.standing import Standing
-from striptools.trace.walk import DONE, MISS, STUCK, largest_of
+from striptools.trace.walk import MISS, STUCK, largest_of, names_leaf
 from striptools.trace.walk_instances import InstancedScene, moved, row_of, value_at
 from striptools.trace.walk_points import (
     Nearest,
@@ -80,7 +80,7 @@ def walk_point(
         return box_squares(scene.boxes_of(node), at, (margin, margin, margin))
 
     def visit(where: Array, nearest: _Nearest) -> _Nearest:
-        there = (where < 0) & (where != DONE)
+        there = names_leaf(where)
         number = jnp.where(there, -(where + 1), 0)
         inside = _search_inside(scene, number, point, margin, options)
         end = searched(inside, scene.root_of(number), there, floor, nearest.near)

@@ -53,6 +53,7 @@ from striptools.trace.walk import (
     Traced,
     WalkOptions,
     WalkScene,
+    names_leaf,
     ready_words,
 )
 
@@ -460,7 +461,7 @@ class _Walk:
 
 
 def _is_at_leaf(state: _State) -> Array:
-    return (state.child < 0) & (state.child != DONE)
+    return names_leaf(state.child)
 
 
 def _at_nodes(state: _State) -> Array:
