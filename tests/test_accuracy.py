@@ -401,7 +401,8 @@ def lowered(test: TriangleTest, resident: str, **asked):
     options = tracer._options(**asked)
     assert options is not None
     words = ROW + 3 * triangle_tests.wants_way(test)
-    return program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, words), np.float32))
+    rows, live = np.zeros((256, words), np.float32), np.full(1, 256, np.int32)
+    return program(tracer._mesh, options).lower(tracer._scene, rows, live)
 
 
 @pytest.mark.parametrize("resident", ["expanded", "compressed"])

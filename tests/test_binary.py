@@ -146,7 +146,8 @@ def test_the_walk_is_hoisted(any_hit, counting):
     tracer = Tracer(under(small_scene(), leaf_size=1), device="cpu")
     options = tracer._options(any_hit=any_hit, counting=counting)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
-    assert_hoisted(program(tracer._mesh, options).lower(tracer._scene, rays))
+    live = np.full(len(tracer.devices), 256, np.int32)
+    assert_hoisted(program(tracer._mesh, options).lower(tracer._scene, rays, live))
 
 
 def test_a_walk_in_circles_ends(ball):

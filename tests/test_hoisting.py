@@ -57,7 +57,8 @@ def lowered_walk(hierarchy="reducem", resident="auto", **asked):
     tracer = Tracer(scene_under(hierarchy), device="cpu", resident=resident)
     options = tracer._options(**asked)
     rays = np.zeros((256 * len(tracer.devices), ROW), np.float32)
-    return program(tracer._mesh, options).lower(tracer._scene, rays)
+    live = np.full(len(tracer.devices), 256, np.int32)
+    return program(tracer._mesh, options).lower(tracer._scene, rays, live)
 
 
 GATHERING = [
@@ -122,7 +123,10 @@ def test_stacks_are_not_copied_at_each_step(resident, any_hit, packets):
     """What is read of a stack leads to what is written next, or XLA writes to a copy of it."""
     tracer = Tracer(scene_under("reducem"), device="cpu", threads=1, resident=resident)
     rays = np.zeros((128, PACKET_ROW) if packets else (256, ROW), np.float32)
-    lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), packets).lower(tracer._scene, rays)
+    live = np.full(1, len(rays), np.int32)
+    lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), packets).lower(
+        tracer._scene, rays, live
+    )
     assert copied_in_loops(lowered.compile().as_text(), f"s32[{tracer._stack_size},2]") == []
 
 

@@ -363,7 +363,8 @@ def text_of(
         rays = np.zeros((256, 3), np.float32)
         return compiled(instances_program(tracer._mesh, options), tracer._scene, rays, rays, rays[:, 0])
     rows = np.zeros((8, PACKET_ROW) if packets else (256, ROW), np.float32)
-    return compiled(program(tracer._mesh, options, packets), tracer._scene, rows)
+    live = np.full(1, len(rows), np.int32)
+    return compiled(program(tracer._mesh, options, packets), tracer._scene, rows, live)
 
 
 def code(text: str) -> set[tuple[str, str]]:
@@ -489,7 +490,8 @@ def test_what_no_block_needs_is_not_decoded(need):
     assert options.decode == (3, False, False, False, False)
     more = options._replace(decode=options.decode._replace(**{need: 4 if need == "words" else True}))
     rows = np.zeros((256, ROW), np.float32)
-    off, on = (compiled(program(tracer._mesh, one), tracer._scene, rows) for one in (options, more))
+    given = tracer._scene, rows, np.full(1, 256, np.int32)
+    off, on = (compiled(program(tracer._mesh, one), *given) for one in (options, more))
     assert instructions(off) < instructions(on)
     assert ("_from_bits" in functions(off)) is False
     assert ("_from_bits" in functions(on)) is (need == "tiny")

@@ -232,7 +232,7 @@ def test_dropped_packets_miss_the_scene():
 def test_the_walk_is_hoisted(resident, any_hit):
     tracer = Tracer(scene_of(Mesh(*sphere(3))), device="cpu", threads=1, resident=resident)
     lowered = program(tracer._mesh, tracer._options(any_hit=any_hit), True).lower(
-        tracer._scene, np.zeros((8, ROW), np.float32)
+        tracer._scene, np.zeros((8, ROW), np.float32), np.full(1, 8, np.int32)
     )
     assert_hoisted(lowered)
 

@@ -446,7 +446,8 @@ def test_threads_trace_the_same(ball):
 def test_walks_are_hoisted(ball, node_test, any_hit, count):
     tracer = tracer_of(ball, 3, node_test)
     given_options = tracer._options(any_hit=any_hit, counting=count)
-    lowered = program(tracer._mesh, given_options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
+    rows, live = np.zeros((256, ROW), np.float32), np.full(1, 256, np.int32)
+    lowered = program(tracer._mesh, given_options).lower(tracer._scene, rows, live)
     assert_hoisted(lowered, loops=3)
 
 

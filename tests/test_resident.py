@@ -253,7 +253,8 @@ def test_walks_are_hoisted(any_hit, steps, remap):
 
     tracer = both(scene_of(Mesh(*sphere(3)), remap=remap))[1]
     options = tracer._options(any_hit=any_hit, counting=steps)
-    lowered = program(tracer._mesh, options).lower(tracer._scene, np.zeros((256, ROW), np.float32))
+    rows, live = np.zeros((256, ROW), np.float32), np.full(1, 256, np.int32)
+    lowered = program(tracer._mesh, options).lower(tracer._scene, rows, live)
     assert_hoisted(lowered, loops=3)
 
 

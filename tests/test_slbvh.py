@@ -480,7 +480,8 @@ def loop_carries(jaxpr):
 def carries_of(scene, any_hit=False, count=False):
     tracer = Tracer(scene, device="cpu", threads=1)
     options = tracer._options(any_hit=any_hit, counting=count)
-    traced = program(tracer._mesh, options).trace(tracer._scene, np.zeros((256, ROW), np.float32))
+    rows, live = np.zeros((256, ROW), np.float32), np.full(1, 256, np.int32)
+    traced = program(tracer._mesh, options).trace(tracer._scene, rows, live)
     return loop_carries(traced.jaxpr.jaxpr)
 
 

@@ -10,11 +10,15 @@ from scenes import scene_of
 from strategies import sphere
 
 from striptools.errors import StriptoolsError
+from striptools.kernels.packets import PACKET, ready_packets
+from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.ray_order import deal
+from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer, launch, streams
 from striptools.trace.rays import Camera, camera_rays
 from striptools.trace.streams import EVERY_RAY
+from striptools.trace.tracer import checked_rays
 
 
 @given(st.integers(0, 500), st.integers(1, 5), st.sampled_from([1, 4, 32]), st.booleans())
@@ -146,3 +150,51 @@ def test_each_device_has_the_scene_where_it_lies(crowd):
     for station, device in zip(stations, tracer.devices, strict=True):
         assert station.scene.nodes.devices() == {device}
         assert station.scene.nodes.unsafe_buffer_pointer() == tracer._layout.arrays.nodes.ctypes.data
+
+
+@pytest.mark.parametrize("packets", [False, True])
+def test_what_lies_behind_the_last_ray_is_not_walked(crowd, packets):
+    """A tile is used again and again: behind its last ray lie those of before."""
+    scene, rays = crowd
+    tracer = Tracer(scene, device="cpu", threads=1)
+    options, station = tracer._options(), tracer._stations[0]
+    assert options is not None
+    size = PACKET_ROW if packets else ROW
+    rows = np.zeros((8, size) if packets else (256, size), np.float32)
+    given, which = checked_rays(*rays, None), np.zeros(0, np.int32)
+    if packets:
+        origins = np.tile(np.float32([0, 0, 9]), (256, 1))
+        way = np.random.default_rng(4).normal(0, 0.01, (256, 3)).astype(np.float32) - np.float32([0, 0, 1])
+        given, seen = checked_rays(origins, way, None), tracer._layout.seen_by_packets
+        places = rows, rows.view(np.int32), np.zeros((8, PACKET), np.int32), np.zeros(512, np.int32)
+        dropped = np.zeros(256, np.uint8)
+        count = ready_packets(*given, which, 0, seen.frame, seen.box, seen.density, *places, dropped)[0]
+    else:
+        seen = tuple(tracer._layout.arrays.frame), *tracer._layout.root
+        places = rows, rows.view(np.int32), np.zeros(256, np.int32), np.zeros(len(rays[0]), np.uint8)
+        count = ready_rays(*given, which, 0, *seen, True, *places)[0]
+    assert count == len(rows)
+    walk = launch.program(station.mesh, options, packets)
+    every, some = (walk(station.scene, rows, np.int32([live])) for live in (count, count // 2))
+    for one, other in zip(every[:2], some[:2], strict=True):
+        np.testing.assert_array_equal(one[: count // 2], other[: count // 2])
+        assert not np.asarray(other[count // 2 :]).any(), "nothing is said of the others"
+    assert (np.asarray(every.name[count // 2 :]) >= 0).any()
+
+
+def test_rays_that_part_are_not_put_into_packets(crowd, monkeypatch):
+    scene, rays = crowd
+    origins, directions = (a[-901:] for a in rays)
+    tracer = Tracer(scene, device="cpu", threads=1)
+    asked = []
+    honest = streams.ready_packets
+    monkeypatch.setattr(streams, "ready_packets", lambda *given: asked.append(1) or honest(*given))
+    apart = tracer.closest_hit(origins, directions)
+    assert asked == []
+    # A quarter of them in rows of 32 is enough.
+    together = directions.copy()
+    quarter = -(-len(together) // 4 // PACKET) * PACKET
+    together[:quarter] = together[0]
+    tracer.closest_hit(origins, together)
+    assert asked == [1]
+    np.testing.assert_array_equal(apart.face, tracer.closest_hit(origins, directions, packets=False).face)

@@ -10,7 +10,7 @@ registers.
 import numpy as np
 from numba import njit
 
-from striptools.kernels.compiled import inlined
+from striptools.kernels.compiled import inlined, kernel
 from striptools.kernels.rays import (
     LEAST_NORMAL,
     ONE,
@@ -47,6 +47,9 @@ ORIGIN, WAY, FAR_OF = 12 * PACKET, 15 * PACKET, 18 * PACKET
 
 FOLD = 19 * PACKET
 ROOM = 20 * PACKET
+
+LOOKED = 256
+"""Packets that are looked at, whether it is worth while to make any."""
 
 WIDER = np.float32(2.0**-21)
 """How much slopes are moved outward: they were rounded, and products with them are."""
@@ -136,6 +139,23 @@ def part_ways(directions, which, begin, end):
         other = way_of(directions, ray_at(which, k))
         apart |= (way >= 0) & (other >= 0) & (other != way)
     return apart
+
+
+@kernel
+def go_together(directions, which):
+    """Whether a quarter or more of 32 rays in a row go the same way, by some that are looked at.
+
+    Args:
+        directions: (r, 3) float32.
+        which: As of `ready_packets`.
+    """
+    every = len(which) if len(which) > 0 else len(directions)
+    packets = (every + PACKET - 1) // PACKET
+    looked, together = min(packets, LOOKED), 0
+    for k in range(looked):
+        begin = k * packets // looked * PACKET
+        together += not part_ways(directions, which, begin, min(begin + PACKET, every))
+    return 4 * together >= looked
 
 
 @inlined

@@ -55,7 +55,8 @@ def replicate(scene: WalkScene, mesh: Mesh) -> WalkScene:
 def program(mesh: Mesh, options: WalkOptions, packets: bool = False) -> Any:
     """The jitted function from a scene and rays to `Traced`, the rays split over the devices.
 
-    Rays are (origins, directions, t_max) where all are walked at once, else ready ones or ready packets.
+    Rays are (origins, directions, t_max) where all are walked at once, else ready ones or ready packets, and
+    how many there are on each device, (devices,) int32.
     """
     walk, arrays = _walk_of(options, packets)
     return split_over(mesh, partial(walk, options=options), arrays)
@@ -77,7 +78,7 @@ def _walk_of(options: WalkOptions, packets: bool) -> tuple[Any, int]:
     """What walks rays, and how many arrays they are."""
     if options.kernel or options.batch:
         return tracing(options), 3
-    return _walk_packets if packets else _walk_ready, 1
+    return _walk_packets if packets else _walk_ready, 2
 
 
 def tracing(options: WalkOptions) -> Callable[..., Traced]:
@@ -90,12 +91,12 @@ def tracing(options: WalkOptions) -> Callable[..., Traced]:
     return trace_rays
 
 
-def _walk_ready(scene: WalkScene, ready: jax.Array, options: WalkOptions) -> Traced:
-    return scene.walk_rays(ready, options)
+def _walk_ready(scene: WalkScene, ready: jax.Array, live: jax.Array, options: WalkOptions) -> Traced:
+    return scene.walk_rays(ready, options, live[0])
 
 
-def _walk_packets(scene: PacketScene, ready: jax.Array, options: WalkOptions) -> Traced:
-    return scene.walk_packets(ready, options)
+def _walk_packets(scene: PacketScene, ready: jax.Array, live: jax.Array, options: WalkOptions) -> Traced:
+    return scene.walk_packets(ready, options, live[0])
 
 
 def _started(mesh: Mesh, options: WalkOptions, scene: WalkScene, *rays: Any) -> Any:

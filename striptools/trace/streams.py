@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from striptools.kernels.packets import PACKET, ready_packets
+from striptools.kernels.packets import PACKET, go_together, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.pictures import row_width, tile_order
 from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
@@ -89,12 +89,13 @@ def trace_ready(
         rays: Origins, directions and t_max.
         dropped: (r,) uint8, written, see `kernels.rays.ready_rays`.
         options: What to compile in.
-        packets: Put rays that go the same way into packets: of those of a picture, tile by tile.
+        packets: Put rays that go the same way into packets, where many do; of a picture, tile by tile.
         take: Takes what was found.
     """
     count = len(rays[0])
     width = row_width(*rays[:2]) if packets else 0
     order = tile_order(count, width) if width else EVERY_RAY
+    packets = packets and go_together(rays[1], order)
     cells = _cells_of(layout) if layout.nbytes >= LEAST_SORTED else None
     hands = stations[: max(1, min(len(stations), count // MANY))]
 
@@ -231,7 +232,7 @@ class _Pipe:
         lanes: tuple[int, ...],
     ) -> None:
         self._scene, self._sizes, self._lanes = station.scene, sizes, lanes
-        self._compiled = program(station.mesh, options, bool(lanes))
+        self._compiled, self._together = program(station.mesh, options, bool(lanes)), options.interleave
         self._shape = next((size for size in sizes if size >= shape[0]), sizes[-1]), shape[1]
         self._spare: list[_Buffers] = []
         self._filling: _Buffers | None = None
@@ -267,10 +268,10 @@ class _Pipe:
         assert buffers is not None
         self._filling, self._filled = None, 0
         rows = buffers.rows[: next(size for size in self._sizes if size >= live)]
-        # Rows of zeros end at once.
-        rows[live:] = 0
+        # The last ray may be walked beside one more: a row of zeros ends at once.
+        rows[live : live + self._together] = 0
         # As they are: to put them on the device, where they lie already, takes longer than the call.
-        traced = self._compiled(self._scene, rows)
+        traced = self._compiled(self._scene, rows, np.array([live], np.int32))
         self._waiting.append((live, traced, buffers))
         if len(self._waiting) >= IN_FLIGHT:
             yield self._collect()

@@ -229,7 +229,7 @@ class WalkScene(Protocol):
         """What visits of so many nodes, leaves and triangles come to."""
         ...
 
-    def walk_rays(self, ready: Array, options: "WalkOptions") -> "Traced":
+    def walk_rays(self, ready: Array, options: "WalkOptions", live: Array | None = None) -> "Traced":
         """Walk r rays made ready: `walk_rays` of this module."""
         ...
 
@@ -445,13 +445,15 @@ def _way_of(direction: Array, ints: Array) -> Array:
     return jnp.stack([pick(scaled, ints[axis]) for axis in range(3)])
 
 
-def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
+def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
     """Walk r rays, r a multiple of `options.interleave`, made ready here or by `kernels.rays`.
 
     Args:
         scene: What to trace.
         ready: (r, 24) or (r, 27) float32, as from `prepared_rays`; rows of zeros are rays that end at once.
         options: What to compile in.
+        live: () int32, how many there are on a CPU, where rows behind them are not looked at but those that
+            fill up the last group, and nothing is said of them; None for all.
     """
     rows = ready.reshape(len(ready) // options.interleave, -1)
     stacks = (empty_stack(scene, options),) * options.interleave
@@ -463,11 +465,38 @@ def walk_rays(scene: WalkScene, ready: Array, options: WalkOptions) -> Traced:
         walked = jax.vmap(lambda group: walk(stacks, group)[1])(rows)
     else:
         # One group's stacks serve the next: only their bottom is read before it is written.
-        walked = lax.scan(walk, stacks, rows)[1]
+        groups = None if live is None else (live + (options.interleave - 1)) // options.interleave
+        walked = scanned(walk, stacks, rows, groups)
     t, name, counters, counted = (a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]) for a in walked)
     if options.any_hit:
         t = jnp.zeros(0)
     return Traced(t, name, counters, counted.reshape(-1))
+
+
+def scanned(
+    step: Callable[[Any, Array], tuple[Any, Any]], carried: Any, rows: Array, count: Array | None
+) -> Any:
+    """What a step says of each row, as by `lax.scan`; of the first `count` rows if that is not None.
+
+    A step is given what the one before leaves, and a row; it returns what it leaves, and what is said.
+    """
+    if count is None:
+        return lax.scan(step, carried, rows)[1]
+    told = jax.eval_shape(step, carried, rows[0])[1]
+    room = jax.tree.map(lambda each: jnp.zeros((len(rows), *each.shape), each.dtype), told)
+
+    def turn(state: tuple[Array, Any, Any]) -> tuple[Array, Any, Any]:
+        place, carried, said = state
+        carried, one = step(carried, lax.dynamic_index_in_dim(rows, index(place), keepdims=False))
+        said = jax.tree.map(partial(_put, place), said, one)
+        return place + 1, carried, said
+
+    return lax.while_loop(lambda state: state[0] < count, turn, (jnp.int32(0), carried, room))[2]
+
+
+def _put(place: Array, values: Array, value: Array) -> Array:
+    """Values with one in a place."""
+    return lax.dynamic_update_index_in_dim(values, value, index(place), 0)
 
 
 def empty_stack(scene: Any, options: WalkOptions) -> Array:

@@ -61,9 +61,9 @@ class BinaryScene(NamedTuple):
     leaves: Leaves
     frame: Frame
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready."""
-        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 2), jnp.float32))
+        return walk_each(self, ready, live, options, _walk, jnp.zeros((options.stack_size, 2), jnp.float32))
 
 
 def _walk(scene: BinaryScene, ray: ReadyRay, stack: Array, options: WalkOptions) -> tuple[Array, Ended]:

@@ -105,9 +105,9 @@ class KdScene(NamedTuple):
     cell: Any
     frame: Frame
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready."""
-        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
+        return walk_each(self, ready, live, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
 
 
 class _Place(NamedTuple):

@@ -161,9 +161,9 @@ class PackedScene(NamedTuple):
                 sides.append(cells.astype(jnp.float32) * unit + low)
         return sides
 
-    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_packets(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk packets made ready."""
-        return walk_packets(self, ready, options)
+        return walk_packets(self, ready, options, live)
 
     def child_of(self, node: Array, lane: Array) -> Array:
         """The child in a lane; a leaf is -(8 node + slot + 1)."""
@@ -237,9 +237,9 @@ class PackedScene(NamedTuple):
         bytes_read = leaves * LEAF_BYTES + triangles * TRIANGLE_BYTES
         return Counters(nodes, leaves, nodes * 8, triangles, nodes * NODE_BYTES, bytes_read)
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready."""
-        return walk_rays(self, ready, options)
+        return walk_rays(self, ready, options, live)
 
     def faces_of(self, names: Array) -> Array:
         """The faces of hits; a name that is none keeps its number."""

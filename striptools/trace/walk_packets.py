@@ -47,6 +47,7 @@ from striptools.trace.walk import (
     lane_bits_of,
     leave_leaf,
     names_leaf,
+    scanned,
     sifted,
     step_down,
 )
@@ -79,7 +80,7 @@ class PacketScene(WalkScene, Protocol):
         """What makes `leaf_of` for one leaf and many rays, again and again for nothing."""
         ...
 
-    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_packets(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk packets: `walk_packets` of this module."""
         ...
 
@@ -188,13 +189,14 @@ class _Box(NamedTuple):
     z: tuple[Array, Array]
 
 
-def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Traced:
+def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
     """Walk p packets.
 
     Args:
         scene: What to trace.
         ready: (p, 272) float32, as from `kernels.packets.ready_packets`; rows of zeros end at once.
         options: What to compile in; rays go side by side as they are, and nothing is counted.
+        live: () int32, how many packets there are; None for all.
 
     Returns:
         Of the rays of each packet, (p, 32).
@@ -203,7 +205,8 @@ def walk_packets(scene: PacketScene, ready: Array, options: WalkOptions) -> Trac
     def walk(stack: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
         return _walk_packet(scene, _packet_of(ready, row), stack, options)
 
-    t, name = lax.scan(walk, empty_stack(scene, options), jnp.arange(len(ready), dtype=jnp.int32))[1]
+    rows = jnp.arange(len(ready), dtype=jnp.int32)
+    t, name = scanned(walk, empty_stack(scene, options), rows, live)
     return Traced(
         jnp.zeros(0) if options.any_hit else t, name, jnp.zeros(0, jnp.int32), jnp.zeros(0, jnp.int32)
     )

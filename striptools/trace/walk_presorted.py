@@ -144,9 +144,9 @@ class PresortedScene(NamedTuple):
         """No ray visits a node twice."""
         return len(self.nodes) + len(self.corners)
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready."""
-        return walk_each(self, ready, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
+        return walk_each(self, ready, live, options, _walk, jnp.zeros((options.stack_size, 3), jnp.int32))
 
 
 class DirectScene(PresortedScene):

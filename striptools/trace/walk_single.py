@@ -14,15 +14,7 @@ from jax import Array, lax
 from striptools.trace.counters import KINDS, Counters
 from striptools.trace.leaf_blocks import test_block, triangles_in
 from striptools.trace.numerics import in_range, index
-from striptools.trace.walk import (
-    DONE,
-    STUCK,
-    WIDTH,
-    Best,
-    ReadyRay,
-    Traced,
-    WalkOptions,
-)
+from striptools.trace.walk import DONE, STUCK, WIDTH, Best, ReadyRay, Traced, WalkOptions, scanned
 
 
 class Leaves(NamedTuple):
@@ -56,12 +48,15 @@ Walk = Callable[[Any, ReadyRay, Array, WalkOptions], tuple[Array, Ended]]
 """A walk of a scene, a live ray and a stack to the stack as it is left and how it ended."""
 
 
-def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack: Array) -> Traced:
+def walk_each(
+    scene: Any, ready: Array, live: Array | None, options: WalkOptions, walk: Walk, stack: Array
+) -> Traced:
     """Walk r rays by a function of one.
 
     Args:
         scene: What to trace.
         ready: (r, 24) float32, as from `walk.prepared_rays`; rows of zeros are rays that end at once.
+        live: As of `walk.walk_rays`.
         options: What to compile in.
         walk: Of one ray. It is called for rays that are none too, of which it is told by `is_live`, and
             should end at once.
@@ -81,7 +76,7 @@ def walk_each(scene: Any, ready: Array, options: WalkOptions, walk: Walk, stack:
     if options.batch:
         t, name, counted = jax.vmap(lambda row: one(stack, row)[1])(ready)
     else:
-        t, name, counted = lax.scan(one, stack, ready)[1]
+        t, name, counted = scanned(one, stack, ready, live)
     return Traced(jnp.zeros(0) if options.any_hit else t, name, counted, jnp.zeros(0, jnp.int32))
 
 

@@ -72,9 +72,9 @@ class SlbvhScene(NamedTuple):
         """() uint32: a leaf without triangles."""
         return jnp.uint32(len(self.leaves.first) - 2)
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready. There is no stack."""
-        return walk_each(self, ready, options, _walk, jnp.zeros(0))
+        return walk_each(self, ready, live, options, _walk, jnp.zeros(0))
 
 
 def step_in(place: Place, right: Array) -> Place:

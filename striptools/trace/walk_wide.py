@@ -106,9 +106,9 @@ class WideScene(NamedTuple):
         """Sides of the box in one lane."""
         return [lax.dynamic_slice(self.nodes, (index(node), row, lane), (1, 1, 1))[0, 0, 0] for row in rows]
 
-    def walk_packets(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_packets(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk packets made ready."""
-        return walk_packets(self, ready, options)
+        return walk_packets(self, ready, options, live)
 
     def triangles_of(self, where: Array) -> Array:
         """() int32: how many triangles a leaf has."""
@@ -119,9 +119,9 @@ class WideScene(NamedTuple):
         boxes = nodes * self.width
         return Counters(nodes, leaves, boxes, triangles, boxes * 28, leaves * 320)
 
-    def walk_rays(self, ready: Array, options: WalkOptions) -> Traced:
+    def walk_rays(self, ready: Array, options: WalkOptions, live: Array | None = None) -> Traced:
         """Walk r rays made ready."""
-        return walk_rays(self, ready, options)
+        return walk_rays(self, ready, options, live)
 
 
 # Notes
