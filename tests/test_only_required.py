@@ -475,7 +475,9 @@ def test_a_remap_is_read_where_two_faces_may_tie(remap, any_hit, there):
     scene = small_scene(remap=remap)
     text = text_of(scene, resident="compressed", any_hit=any_hit)
     assert ("PackedScene.faces_of" in functions(text)) is there
-    assert any(one.startswith("s32[") and one != "s32[]" for one in signature(text)[0]) is there
+    # One number says how many rays there are.
+    numbers = [one for one in signature(text)[0] if one.startswith("s32[") and one not in ("s32[]", "s32[1]")]
+    assert (numbers != []) is there
 
 
 def instructions(text: str) -> int:
