@@ -277,8 +277,9 @@ class Tracer:
             directions: (r, 3).
             t_max: (r,) or one for all: only hits nearer than this count; None for any distance.
             counters: Count what each ray visits, tests and reads (a program of its own, somewhat slower).
-            packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side:
-                those of a camera or towards a light. Hits are the same. Not of other tests than the default.
+            packets: Walk rays that go the same way in packets, on a CPU, where they are found side by side, a
+                quarter of all or more: those of a camera or towards a light. Hits are the same. Not of other
+                tests than the default.
             weights: Tell u and v; without them each is None, and hits are not weighed on this side.
 
         Raises:
