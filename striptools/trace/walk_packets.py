@@ -444,4 +444,4 @@ def _walk_packet(
 # LLVM finds step by step too, 1.0.
 #
 # Weights of hits worked out where triangles are tested, and carried along, so that the host need not read
-# leaves again (a tenth of a camera's time; the same bits): 0.74 to 0.81 expanded, 0.94 to 0.99 compressed.
+# leaves again (a tenth of a camera's time): 0.74 to 0.81 expanded, 0.94 to 0.99 compressed.
