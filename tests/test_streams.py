@@ -1,4 +1,4 @@
-"""Rays dealt out to devices, a thread each, and streamed in tiles: each once, whatever the devices."""
+"""Rays that devices take in runs, a thread each, and streamed in tiles: each once, whatever the devices."""
 
 import threading
 
@@ -12,7 +12,6 @@ from strategies import sphere
 from striptools.errors import StriptoolsError
 from striptools.kernels.packets import PACKET, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
-from striptools.kernels.ray_order import deal
 from striptools.kernels.rays import ROW, ready_rays
 from striptools.mesh.mesh import Mesh
 from striptools.trace import Tracer, launch, streams
@@ -21,14 +20,35 @@ from striptools.trace.streams import EVERY_RAY
 from striptools.trace.tracer import checked_rays
 
 
-@given(st.integers(0, 500), st.integers(1, 5), st.sampled_from([1, 4, 32]), st.booleans())
-def test_rays_are_dealt_like_cards(every, hands, block, chosen):
-    which = np.random.default_rng(every).permutation(every).astype(np.int32) if chosen else EVERY_RAY
-    rays = which.tolist() if len(which) else list(range(every))
-    expected = [[] for _ in range(hands)]
-    for k in range(0, every, block):
-        expected[k // block % hands] += rays[k : k + block]
-    assert [deal(which, every, hand, hands, block).tolist() for hand in range(hands)] == expected
+@given(st.integers(1, 10**7), st.integers(1, 64), st.booleans(), st.booleans())
+def test_runs_are_taken_once_and_get_shorter(count, hands, packets, chosen):
+    order = np.arange(count, dtype=np.int32)[::-1].copy() if chosen and count < 10**5 else EVERY_RAY
+    runs = list(streams._Runs(count, order, hands, packets))
+    if hands == 1:
+        assert len(runs) == 1
+        np.testing.assert_array_equal(runs[0], order)
+        return
+    taken = np.concatenate(runs) if len(runs) > 1 or len(runs[0]) else np.arange(count)
+    np.testing.assert_array_equal(taken, order if len(order) else np.arange(count))
+    lengths = [len(run) for run in runs]
+    assert all(length % PACKET == 0 for length in lengths[:-1])
+    assert lengths == sorted(lengths, reverse=True)
+    longest = PACKET * streams.PACKET_TILES[-1] if packets else streams.TILES[-1]
+    assert max(lengths) <= longest
+    # The last run is no longer than what each of the others has on its way.
+    assert lengths[-1] <= max(longest // streams.SHORTEST, count // hands)
+
+
+def test_threads_take_each_run_once():
+    """Where one takes what another is about to take, that one is done."""
+    runs, taken = streams._Runs(10**6, EVERY_RAY, 8, packets=False), []
+    threads = [threading.Thread(target=lambda: taken.extend(runs)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert np.array_equal(np.sort(np.concatenate(taken)), np.arange(10**6))
+    assert list(runs) == []
 
 
 def all_found(of, rays):
@@ -63,21 +83,20 @@ def test_any_number_of_devices_and_any_tiles_find_the_same(crowd, monkeypatch, r
     one, two = (Tracer(scene, device="cpu", threads=k, resident=resident) for k in (1, 2))
     needs_two(two)
     expected = all_found(one, rays)
-    hands = []
-    honest = streams.deal
+    threads = []
+    honest = streams.ready_rays
 
     def noting(*given):
-        hands.append((threading.get_ident(), given[2]))
+        threads.append(threading.get_ident())
         return honest(*given)
 
-    monkeypatch.setattr(streams, "deal", noting)
+    monkeypatch.setattr(streams, "ready_rays", noting)
     assert all_found(two, rays) == expected
-    assert hands == [], "so few rays go through one device"
+    assert set(threads) == {threading.get_ident()}, "so few rays go through one device"
     monkeypatch.setattr(streams, "MANY", 100)
-    monkeypatch.setattr(streams, "BLOCK", 64)
+    monkeypatch.setattr(streams, "SHORTEST", 2**10)
     assert all_found(two, rays) == expected
-    assert {hand for _, hand in hands} == set(range(len(two.devices)))
-    assert len({thread for thread, _ in hands}) > 1
+    assert len(set(threads)) > 2
     # Tiles that are full many times over, and last ones that are nearly empty.
     monkeypatch.setattr(streams, "TILES", (2**6, 2**8))
     monkeypatch.setattr(streams, "PACKET_TILES", (2**3, 2**4))
@@ -92,7 +111,7 @@ def test_few_rays(crowd, monkeypatch, count):
     one, two = (Tracer(scene, device="cpu", threads=k) for k in (1, 2))
     expected = all_found(one, few)
     monkeypatch.setattr(streams, "MANY", 1)
-    monkeypatch.setattr(streams, "BLOCK", 32)
+    monkeypatch.setattr(streams, "SHORTEST", 2**10)
     assert all_found(two, few) == expected
 
 
@@ -102,7 +121,7 @@ def test_where_one_device_fails_the_others_stop_and_it_is_told(crowd, monkeypatc
     tracer = Tracer(scene, device="cpu", threads=2)
     needs_two(tracer)
     monkeypatch.setattr(streams, "MANY", 100)
-    monkeypatch.setattr(streams, "BLOCK", 32)
+    monkeypatch.setattr(streams, "SHORTEST", 2**10)
     monkeypatch.setattr(streams, "TILES", (2**6,))
     here, taken = threading.local(), []
     at_once, weigh = streams.at_once, tracer._weigh

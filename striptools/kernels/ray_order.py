@@ -1,4 +1,4 @@
-"""Kernels that sort rays by where they start and which way they go, or deal them out.
+"""Kernels that sort rays by where they start and which way they go.
 
 Source: Aila & Karras, "Architecture Considerations for Tracing Incoherent Rays" (HPG 2010), section 4.4, who
 sort rays by Morton codes of origin and direction; here the direction's octant does, which is the order of
@@ -110,25 +110,3 @@ def sort_rays(origins, directions, which, begin, end, low, finer):
         order[ends[1, digit]] = entry & (2**RAY - 1)
         ends[1, digit] += 1
     return order
-
-
-@kernel
-def deal(which, every, hand, hands, block):
-    """The rays of one hand, where all are dealt out in blocks, turn by turn.
-
-    Args:
-        which: As of `sort_rays`.
-        every: How many rays there are.
-        hand: Whose, from 0.
-        hands: How many there are to deal to.
-        block: Rays of a block.
-
-    Returns:
-        (m,) int32.
-    """
-    whole = every // (block * hands) * block
-    rest = every - whole * hands - hand * block
-    mine = np.empty(whole + max(0, min(rest, block)), np.int32)
-    for k in range(len(mine)):
-        mine[k] = ray_at(which, (k // block * hands + hand) * block + k % block)
-    return mine

@@ -1,13 +1,16 @@
 """Rays that this side makes ready, streamed through CPU devices: a core for each share of them.
 
-Rays are dealt out to the devices in small blocks, turn by turn, so that all have like work. A thread for each
-device makes its rays ready, has them walked, and takes what was found: none waits for another. One program
-for all devices would be as good a way to share out the walk, but it ends when the last of them does, and
-work on this side makes one of them late: two cores were busy 1.6 to 1.7 times as much as one so.
+A thread for each device takes a run of rays, makes them ready, has them walked, takes what was found, and so
+on until no run is left: none waits for another, and one whose core has other work does less. Runs get shorter
+towards the end, so that all end together (guided self-scheduling: Polychronopoulos & Kuck 1987). One program
+for all devices would be as good a way to share out the walk, but it ends when the last of them does, and work
+on this side makes one of them late: two cores were busy 1.6 to 1.7 times as much as one so.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import pairwise
 from threading import Event
 from typing import Any, NamedTuple
 
@@ -18,7 +21,7 @@ from jax.sharding import Mesh
 from striptools.kernels.packets import PACKET, go_together, ready_packets
 from striptools.kernels.packets import ROW as PACKET_ROW
 from striptools.kernels.pictures import row_width, tile_order
-from striptools.kernels.ray_order import CELLS, deal, sort_rays, start_apart
+from striptools.kernels.ray_order import CELLS, sort_rays, start_apart
 from striptools.kernels.rays import ROW, ready_rays, room_of
 from striptools.threads import at_once
 from striptools.trace.device import quiet_jax
@@ -34,8 +37,11 @@ PACKET_TILES = (2**3, 2**7, 2**12)
 MANY = 2**13
 """Rays for each device for which it is worth while to start a thread: fewer go through the first alone."""
 
-BLOCK = 2**10
-"""Rays of a block that is dealt out: whole packets."""
+SHARES = 2
+"""Runs for each device, at least, into which rays that are left are cut; of packets half as many."""
+
+SHORTEST = 8
+"""Of a tile, the part that the shortest runs are: a tile not full costs as much beside its walk."""
 
 IN_FLIGHT = 2
 """Tiles that a device works on or waits for: more only push each other's rays out of the cache."""
@@ -99,16 +105,91 @@ def trace_ready(
     cells = _cells_of(layout) if layout.nbytes >= LEAST_SORTED else None
     hands = stations[: max(1, min(len(stations), count // MANY))]
 
-    def trace(hand: int, stopped: Event) -> None:
-        which = deal(order, count, hand, len(hands), BLOCK) if len(hands) > 1 else order
-        course = _Course(hands[hand], layout, cells, rays, which, dropped, options)
-        for found in course.packets() if packets else course.singles():
-            if stopped.is_set():
-                return
-            take(*found)
-
     with quiet_jax():
+        if not packets:
+            order = _sorted(rays, order, cells, len(hands))
+        runs = _Runs(count, order, len(hands), packets)
+
+        def trace(hand: int, stopped: Event) -> None:
+            course = _Course(hands[hand], layout, cells, rays, runs, dropped, options)
+            for found in course.packets() if packets else course.singles():
+                if stopped.is_set():
+                    return
+                take(*found)
+
         at_once(trace, len(hands))
+
+
+class _Cells(NamedTuple):
+    """What rays are sorted by: where cells begin, (3,) float32, and how many are in a unit of length."""
+
+    low: np.ndarray
+    finer: np.float32
+
+
+def _cells_of(layout: Layout) -> _Cells:
+    """Those of a scene, whose bounds are those of its root."""
+    frame, box = layout.arrays.frame, layout.root[0]
+    corners = np.stack([np.nanmin(box[:3], axis=1), np.nanmax(box[3:6], axis=1)]).astype(np.float64)
+    low, high = (corners * frame.unit + frame.low) / frame.scale
+    extent = max((high - low).max(), CELLS * np.finfo(np.float32).tiny)
+    return _Cells(low.astype(np.float32), np.float32(CELLS / extent))
+
+
+def _sorted(rays: Rays, which: np.ndarray, cells: _Cells | None, threads: int) -> np.ndarray:
+    """Rays as they come; where most jump about in a large scene, sorted, so that neighbours go alike."""
+    if cells is None or not start_apart(rays[0], which, cells.finer):
+        return which
+    count = len(which) or len(rays[0])
+    parts = -(-count // (SORTED * threads)) * threads
+    bounds = [count * k // parts for k in range(parts + 1)]
+    order = np.zeros(count, np.int32)
+
+    def sort(hand: int, _: Event) -> None:
+        for begin, end in list(pairwise(bounds))[hand::threads]:
+            order[begin:end] = sort_rays(*rays[:2], which, begin, end, *cells)
+
+    at_once(sort, threads)
+    return order
+
+
+class _Runs:
+    """Rays in runs that several threads take from, one after the other; for one thread they are one run.
+
+    Args:
+        count: Rays there are.
+        order: (count,) int32, the rays; (0,) for all as they come.
+        hands: Threads that take.
+        packets: Whether runs are for packets.
+    """
+
+    def __init__(self, count: int, order: np.ndarray, hands: int, packets: bool) -> None:
+        self._order, self._count, shares = order, count, (1 if packets else SHARES) * hands
+        longest = PACKET * PACKET_TILES[-1] if packets else TILES[-1]
+        shortest = min(longest // SHORTEST, -(-count // hands))
+        self._waiting: deque[tuple[int, int]] = deque()
+        begin = 0
+        while begin < count:
+            share = (count - begin) // shares
+            end = begin + _whole(max(shortest, min(share, longest))) if hands > 1 else count
+            self._waiting.append((begin, min(count, end)))
+            begin = end
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        # Several threads may be here: who finds nothing left is done.
+        with suppress(IndexError):
+            while True:
+                yield self._rays(*self._waiting.popleft())
+
+    def _rays(self, begin: int, end: int) -> np.ndarray:
+        if end - begin == self._count:
+            return self._order
+        return self._order[begin:end] if len(self._order) else np.arange(begin, end, dtype=np.int32)
+
+
+def _whole(count: int) -> int:
+    """So many rays, or a few more: packets are whole."""
+    return -(-count // PACKET) * PACKET
 
 
 Parts = Iterator[tuple[np.ndarray, tuple[np.ndarray, ...]]]
@@ -121,88 +202,65 @@ class _Course(NamedTuple):
     Attributes:
         station: The device.
         layout: The scene on this side.
-        cells: Where the cells begin that rays are sorted by, and how many there are in a unit of length; None
-            for a scene for which none are.
+        cells: By which rays are sorted that go on their own after all; None for a scene for which none are.
         rays: All there are.
-        which: Those that go this way, in this order, int32; (0,) for all of them.
+        runs: Those that are still to be taken.
         dropped: As of `trace_ready`, and so is what follows.
         options: What to compile in.
     """
 
     station: Station
     layout: Layout
-    cells: tuple[np.ndarray, np.float32] | None
+    cells: _Cells | None
     rays: Rays
-    which: np.ndarray
+    runs: _Runs
     dropped: np.ndarray
     options: WalkOptions
-
-    @property
-    def total(self) -> int:
-        """How many rays go this way."""
-        return len(self.which) or len(self.rays[0])
 
     def singles(self) -> Parts:
         """Trace each ray on its own."""
         pipe = self._single_pipe()
-        yield from self._send_each(pipe, self.which)
+        for which in self.runs:
+            yield from self._send_each(pipe, which)
+            yield from pipe.flush()
         yield from pipe.drain()
 
     def packets(self) -> Parts:
         """Trace rays in packets, those that go the same way."""
-        single = self._single_pipe()
-        shape = (-(-self.total // PACKET), PACKET_ROW)
+        single, count = self._single_pipe(), len(self.rays[0])
+        shape = (-(-count // PACKET), PACKET_ROW)
         packed = _Pipe(self.station, self.options, PACKET_TILES, shape, (PACKET,))
-        alone = np.zeros(min(TILES[-1], self.total) + PACKET, np.int32)
-        seen, begin = self.layout.seen_by_packets, 0
+        alone = np.zeros(min(TILES[-1], count) + PACKET, np.int32)
+        seen = self.layout.seen_by_packets
         assert seen is not None
         given = (seen.frame, seen.box, seen.density)
-        while begin < self.total:
-            rows, at = packed.room()
-            places = (rows, rows.view(np.int32), at, alone, self.dropped)
-            live, left, begin = ready_packets(*self.rays, self.which, begin, *given, *places)
-            yield from packed.fill(live)
-            if left:
-                yield from self._send_each(single, alone[:left])
+        for which in self.runs:
+            begin, end = 0, len(which) or count
+            while begin < end:
+                rows, at = packed.room()
+                places = (rows, rows.view(np.int32), at, alone, self.dropped)
+                live, left, begin = ready_packets(*self.rays, which, begin, *given, *places)
+                yield from packed.fill(live)
+                if left:
+                    yield from self._send_each(single, _sorted(self.rays, alone[:left], self.cells, 1))
+            yield from packed.flush()
+            yield from single.flush(TILES[-1] // SHORTEST)
         yield from packed.drain()
         yield from single.drain()
 
     def _single_pipe(self) -> "_Pipe":
         words = ROW + 3 * wants_way(self.options.test)
-        return _Pipe(self.station, self.options, TILES, (self.total, words), ())
+        return _Pipe(self.station, self.options, TILES, (len(self.rays[0]), words), ())
 
     def _send_each(self, pipe: "_Pipe", which: np.ndarray) -> Parts:
         """Send rays, each on its own."""
         seen = (tuple(self.layout.arrays.frame), *self.layout.root)
-        for part in self._in_order(which):
-            begin, count = 0, len(part) or len(self.rays[0])
-            while begin < count:
-                rows, at = pipe.room()
-                places = (rows, rows.view(np.int32), at, self.dropped)
-                live, begin = ready_rays(*self.rays, part, begin, *seen, True, *places)
-                yield from pipe.fill(live)
-
-    def _in_order(self, which: np.ndarray) -> Iterator[np.ndarray]:
-        """Rays as they come; where most jump about in a large scene, sorted, so that neighbours go alike."""
-        if self.cells is None:
-            yield which
-            return
-        low, finer = self.cells
-        if not start_apart(self.rays[0], which, finer):
-            yield which
-            return
-        count = len(which) or len(self.rays[0])
-        for first in range(0, count, SORTED):
-            yield sort_rays(*self.rays[:2], which, first, min(first + SORTED, count), low, finer)
-
-
-def _cells_of(layout: Layout) -> tuple[np.ndarray, np.float32]:
-    """See `_Course.cells`."""
-    frame, box = layout.arrays.frame, layout.root[0]
-    corners = np.stack([np.nanmin(box[:3], axis=1), np.nanmax(box[3:6], axis=1)]).astype(np.float64)
-    low, high = (corners * frame.unit + frame.low) / frame.scale
-    extent = max((high - low).max(), CELLS * np.finfo(np.float32).tiny)
-    return low.astype(np.float32), np.float32(CELLS / extent)
+        begin, end = 0, len(which) or len(self.rays[0])
+        while begin < end:
+            rows, at = pipe.room()
+            places = (rows, rows.view(np.int32), at, self.dropped)
+            live, begin = ready_rays(*self.rays, which, begin, *seen, True, *places)
+            yield from pipe.fill(live)
 
 
 class _Buffers(NamedTuple):
@@ -251,10 +309,14 @@ class _Pipe:
         if self._filling is not None and self._filled == len(self._filling.rows):
             yield from self._send()
 
+    def flush(self, most: int = 0) -> Parts:
+        """Send what is filled where it is more than so many."""
+        if self._filled > most:
+            yield from self._send()
+
     def drain(self) -> Parts:
         """Send what is left, and yield all that is on its way."""
-        if self._filled:
-            yield from self._send()
+        yield from self.flush()
         while self._waiting:
             yield self._collect()
 
@@ -295,6 +357,11 @@ class _Pipe:
 # and 5 to 10 % more time of the processor, as the two share a cache. Two threads on one device scale as
 # well as two devices, by a program that is compiled once; devices compile theirs side by side in the same
 # time. Tiles of 2**14 and 2**15 rays, and three in flight: within 3 %.
+#
+# Runs taken by who is free, over blocks dealt out turn by turn, two cores that others use too (medians): one
+# by one 1.03 to 1.15, occlusion 1.04 to 1.18, random rays 1.0, packets 0.97 to 1.05; where nobody else was
+# there 0.98 to 1.03. Three shares a device and six 0.99 to 1.0 of two; of packets two shares 0.95 of one, as
+# what XLA fills for a tile costs the same however few are in it.
 #
 # On one core rays made ready 64 at a time gave 1.15 (occlusion rays), packets over whole registers 1.1,
 # hits weighed with leaves touched beforehand 1.05, fetched while others are weighed 1.03 more (a camera's
