@@ -5,8 +5,8 @@
 MODEL is a mesh or a scene file. One core is all threads of the process pinned to the first core and one
 device; two cores are two devices and no pins. One device beside a free core is measured too: the tracer's
 host kernels then have that core. Other programs may run on the machine or beside it, so least times are
-compared, which are those of its quietest moments (two cores seldom have the same one: if anything the ratio is
-too small), and medians, too. Beside both stands what two cores gave a loop that only computes, in the same
+compared, which are those of its quietest moments (if two cores seldom have the same one, the ratio is too
+small), and medians, too. Beside both stands what two cores gave a loop that only computes, in the same
 minutes: as much as the tracer could gain. Linux only.
 """
 
@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -76,18 +77,13 @@ def measure(name: str, scene: Scene, side: int, seconds: float) -> list[Row]:
             calls = [partial(getattr(tracer, query), *rays, packets=packets) for tracer in (one, two)]
             found = by_turns(calls[0], calls[1], seconds)
             what = f"{kind}, {query.replace('_', ' ')}"
-            for name_of, of in (("least times", found.least), ("medians", found.median)):
+            for times, of in (("least times", found.least), ("medians", found.median)):
+                gain, beside, loop = of.pinned / of.both, of.pinned / of.beside, 2 * of.alone / of.together
                 said = f"{len(rays[0])} rays, {found.turns} times each; one device beside a free core "
-                said += (
-                    f"{of.pinned / of.beside:.3g}; a loop that only computes {2 * of.alone / of.together:.3g}"
-                )
-                gain, metric = of.pinned / of.both, f"{what}, {name_of}"
-                rows.append(
-                    Row("scaling", name, scene.triangle_count, metric, gain, "of one core", note=said)
-                )
-                sys.stdout.write(
-                    f"{name}: {metric}: {gain:.3f} of one core ({said}), {1000 * of.both:.0f} ms\n"
-                )
+                said += f"{beside:.3g}; a loop that only computes {loop:.3g}"
+                row = Row("scaling", name, scene.triangle_count, f"{what}, {times}", gain, "of one core")
+                rows.append(replace(row, note=said))
+                sys.stdout.write(f"{name}: {row.metric}: {gain:.3f} of one core ({said})\n")
             sys.stdout.flush()
     return rows
 
