@@ -255,7 +255,7 @@ def find_corners(blocks, words, names, places):
         places: (3, 64) int64, written: the bits where corners a, b and c begin.
     """
     for i in range(len(names)):
-        block = np.int64(names[i] >> 8)
+        block = np.uint64(names[i] >> 8)
         a, b, c = corner_indices(blocks, words, block, np.int64(names[i] & 255))
         begin = (np.int64(blocks[block, HEAD + 1]) << 5) + (np.int64(blocks[block, HEAD + 2]) >> 13)
         stride = np.int64(blocks[block, HEAD + 3]) & 127
@@ -280,7 +280,7 @@ def decode_corners(blocks, words, names, places, corners, turns):
     """
     # Take them.
     for i in range(len(names)):
-        block = names[i] >> 8
+        block = np.uint64(names[i] >> 8)
         for axis in range(3):
             anchor = np.int64(np.int32(blocks[block, 4 * axis]))
             said = np.int64(blocks[block, 4 * axis + 3])
@@ -383,6 +383,7 @@ def weigh_packed_hits(
     turns = np.zeros((2, CHUNK), np.int32)
     turn_of = np.zeros(CHUNK, np.int32)
     decoded = 0
+    flat = corners.reshape(corners.size)
     find_corners(blocks, words, names[:CHUNK], places[0])
     for begin in range(0, len(rays), CHUNK):
         end = min(begin + CHUNK, len(rays))
@@ -397,9 +398,12 @@ def weigh_packed_hits(
             r, slot = rays[begin + i], slots[begin + i]
             half, column = slot // CHUNK & 1, slot % CHUNK
             axes = take_ray(origins, directions, r, room, i)
+            first = np.uint64(half * 9 * CHUNK + column)
             for axis in range(3):
+                row = first + axes[axis] * np.uint64(3 * CHUNK)
                 for j in range(3):
-                    room[CORNERS + (3 * axis + j) * CHUNK + i] = corners[half, 3 * axes[axis] + j, column]
+                    place = np.uint64(CORNERS + (3 * axis + j) * CHUNK + i)
+                    room[place] = flat[row + np.uint64(j * CHUNK)]
             # Name its corners as the reported face does.
             rotation = rotations[triangle[r]] if len(rotations) > 0 else 0
             turn_of[i] = (turns[half, column] + rotation) % 3

@@ -21,35 +21,39 @@ BLOCK = 10 * WIDTH
 
 WAY, START, CORNERS, WEIGHTS = 0, 3 * CHUNK, 6 * CHUNK, 15 * CHUNK
 
-ROOM = 18 * CHUNK
+ROOM = 17 * CHUNK
 """Numbers of a chunk, rows of 64: direction and origin along the hit's x, y, z; x of the corners, y, z; then
-the weights of the corners."""
+the weights of the reported face's second corner and third."""
 
 
 @inlined
 def take_ray(origins, directions, r, room, i):
     """Gather a ray as place i, and return its axes: z the dominant one."""
-    size_x = abs(flushed(directions[r, 0]))
-    size_y = abs(flushed(directions[r, 1]))
-    size_z = abs(flushed(directions[r, 2]))
-    kz = 0 if (size_x >= size_y) & (size_x >= size_z) else (1 if size_y >= size_z else 2)
-    kx = 0 if kz == 2 else kz + 1
-    ky = 0 if kx == 2 else kx + 1
-    room[WAY + i] = directions[r, kx]
-    room[WAY + CHUNK + i] = directions[r, ky]
-    room[WAY + 2 * CHUNK + i] = directions[r, kz]
-    room[START + i] = origins[r, kx]
-    room[START + CHUNK + i] = origins[r, ky]
-    room[START + 2 * CHUNK + i] = origins[r, kz]
-    return kx, ky, kz
+    # Numbers without a sign are not looked at, whether they count from the end.
+    r, i = np.uint64(r), np.uint64(i)
+    dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+    ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
+    size_x, size_y, size_z = abs(flushed(dx)), abs(flushed(dy)), abs(flushed(dz))
+    along_x = (size_x >= size_y) & (size_x >= size_z)
+    along_y = size_y >= size_z
+    room[np.uint64(WAY) + i] = dy if along_x else (dz if along_y else dx)
+    room[np.uint64(WAY + CHUNK) + i] = dz if along_x else (dx if along_y else dy)
+    room[np.uint64(WAY + 2 * CHUNK) + i] = dx if along_x else (dy if along_y else dz)
+    room[np.uint64(START) + i] = oy if along_x else (oz if along_y else ox)
+    room[np.uint64(START + CHUNK) + i] = oz if along_x else (ox if along_y else oy)
+    room[np.uint64(START + 2 * CHUNK) + i] = ox if along_x else (oy if along_y else oz)
+    kx = np.uint64(1) if along_x else (np.uint64(2) if along_y else np.uint64(0))
+    ky = np.uint64(2) if along_x else (np.uint64(0) if along_y else np.uint64(1))
+    return kx, ky, np.uint64(3) - kx - ky
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def weigh_chunk(room, scale):
+def weigh_chunk(room, turn_of, scale):
     """Weigh the corners of a whole chunk; places that hold no hit get any weights.
 
     Args:
-        room: (1152,) float32; corners are scaled, hold no denormals, and come in the order of the tests.
+        room: (1088,) float32; corners are scaled, hold no denormals, and come in the order of the tests.
+        turn_of: (64,) int32: corner j is the reported face's (j + turn) % 3.
         scale: float32, what corners were multiplied by.
     """
     for i in range(CHUNK):
@@ -79,31 +83,28 @@ def weigh_chunk(room, scale):
         whole = a + b + c
         inverse = np.float32(1.0) / whole
         inverse = inverse if whole != np.float32(0.0) else np.float32(0.0)
-        room[WEIGHTS + i] = a * inverse
-        room[WEIGHTS + CHUNK + i] = b * inverse
-        room[WEIGHTS + 2 * CHUNK + i] = c * inverse
-
-
-@inlined
-def give_weights(room, i, turn, r, u, v):
-    """Write u and v of place i as the reported face names its corners: corner j is its (j + turn) % 3."""
-    u[r] = room[WEIGHTS + (1 if turn == 0 else (0 if turn == 1 else 2)) * CHUNK + i]
-    v[r] = room[WEIGHTS + (2 - turn) * CHUNK + i]
+        turn = turn_of[i]
+        room[WEIGHTS + i] = (b if turn == 0 else (a if turn == 1 else c)) * inverse
+        room[WEIGHTS + CHUNK + i] = (c if turn == 0 else (b if turn == 1 else a)) * inverse
 
 
 @inlined
 def weigh_held(room, held, scale, ray_of, turn_of, u, v):
     """Write u and v of the first `held` places of a chunk, of these rays and turns."""
-    weigh_chunk(room, scale)
-    for i in range(held):
-        give_weights(room, i, turn_of[i], ray_of[i], u, v)
+    weigh_chunk(room, turn_of, scale)
+    for k in range(held):
+        i = np.uint64(k)
+        r = np.uint64(ray_of[i])
+        u[r] = room[np.uint64(WEIGHTS) + i]
+        v[r] = room[np.uint64(WEIGHTS + CHUNK) + i]
 
 
 @inlined
 def find_slots(place, names, begin, end, slots, blocks):
     """Find where the triangles hit lie, and have their lines fetched: two rows of a block are one."""
-    for i in range(begin, end):
-        slot = place[names[i]]
+    for k in range(begin, end):
+        i = np.uint64(k)
+        slot = place[np.uint64(names[i])]
         slots[i] = slot
         first = (slot >> 5) * BLOCK
         for row in range(0, 10, 2):
@@ -111,17 +112,19 @@ def find_slots(place, names, begin, end, slots, blocks):
 
 
 @inlined
-def gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, room, turn_of):
+def gather_from_blocks(origins, directions, numbers, rays, slots, begin, end, room, turn_of):
     """Gather rays and corners of hits."""
-    for i in range(end - begin):
-        kx, ky, kz = take_ray(origins, directions, rays[begin + i], room, i)
-        slot = slots[begin + i]
-        block, lane = slot >> 5, (slot >> 2) & 7
-        for j in range(3):
-            room[CORNERS + j * CHUNK + i] = blocks[block, 3 * kx + j, lane]
-            room[CORNERS + (3 + j) * CHUNK + i] = blocks[block, 3 * ky + j, lane]
-            room[CORNERS + (6 + j) * CHUNK + i] = blocks[block, 3 * kz + j, lane]
-        turn_of[i] = slot & 3
+    for k in range(begin, end):
+        i = np.uint64(k - begin)
+        axes = take_ray(origins, directions, rays[np.uint64(k)], room, i)
+        slot = np.uint64(slots[np.uint64(k)])
+        first = (slot >> np.uint64(5)) * np.uint64(BLOCK) + (slot >> np.uint64(2) & np.uint64(7))
+        for axis in range(3):
+            row = first + axes[axis] * np.uint64(3 * WIDTH)
+            for j in range(3):
+                place = np.uint64(CORNERS + (3 * axis + j) * CHUNK) + i
+                room[place] = numbers[row + np.uint64(j * WIDTH)]
+        turn_of[i] = slot & np.uint64(3)
 
 
 @maker
@@ -131,12 +134,13 @@ def note_hits(at, found_t, found, t):
     held = 0
     for k in range(len(at)):
         # Without a branch, which would go astray: whether a ray hits anything is hard to foresee.
-        rays[held] = k
+        rays[np.uint64(held)] = k
         held += np.int64((at[k] >= 0) & (found[k] >= 0))
-    for i in range(held):
-        k = rays[i]
+    for j in range(held):
+        i = np.uint64(j)
+        k = np.uint64(rays[i])
         rays[i], names[i] = at[k], found[k]
-        t[at[k]] = found_t[k]
+        t[np.uint64(at[k])] = found_t[k]
     return rays[:held], names[:held]
 
 
@@ -163,20 +167,23 @@ def weigh_hits(
         triangle: (r,) int32, written.
     """
     rays, names = note_hits(at, found_t, found_face, t)
-    for i in range(len(rays)):
-        face[rays[i]] = names[i]
-        triangle[rays[i]] = triangle_of[names[i]] if len(triangle_of) > 0 else names[i]
+    for k in range(len(rays)):
+        i = np.uint64(k)
+        r, name = np.uint64(rays[i]), np.uint64(names[i])
+        face[r] = name
+        triangle[r] = triangle_of[name] if len(triangle_of) > 0 else name
     if len(u) == 0:
         return
     room = np.zeros(ROOM, np.float32)
-    turn_of = np.empty(CHUNK, np.int32)
+    turn_of = np.zeros(CHUNK, np.int32)
     slots = np.empty(len(rays), np.int32)
+    numbers = blocks.reshape(blocks.size)
     for begin in range(-CHUNK, len(rays), CHUNK):
         # The lines that the next chunk needs are fetched while this one is weighed.
         end = min(begin + CHUNK, len(rays))
         find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, blocks)
         if begin >= 0:
-            gather_from_blocks(origins, directions, blocks, rays, slots, begin, end, room, turn_of)
+            gather_from_blocks(origins, directions, numbers, rays, slots, begin, end, room, turn_of)
             weigh_held(room, end - begin, scale, rays[begin:end], turn_of, u, v)
 
 
