@@ -221,10 +221,11 @@ def ready_packets(
         if not same:
             alone = send_alone(which, begin, end, single, alone)
             continue
-        for k in range(begin, end):
-            dropped[ray_at(which, k)] = 2
+        if live < end - begin:
+            for k in range(begin, end):
+                dropped[ray_at(which, k)] = 2
         for k in range(live):
-            dropped[ray_at(which, begin + lane_of[k])] = 0
+            dropped[ray_at(which, begin + lane_of[np.uint64(k)])] = 0
         if live == 0:
             continue
 
@@ -276,8 +277,9 @@ def ready_packets(
         words[count, 15] = octant
 
         # Write the rays.
+        rays_of = at[count]
         for k in range(PACKET):
-            at[count, k] = ray_at(which, begin + lane_of[k]) if k < live else -1
+            rays_of[k] = np.int32(ray_at(which, begin + lane_of[k])) if k < live else np.int32(-1)
         for k in range(8 * PACKET):
             row[HEAD + k] = room[k]
         count += 1

@@ -64,7 +64,7 @@ def start_apart(origins, which, finer):
 def count_keys(origins, directions, which, begin, low, finer, keys, ends):
     """Write keys and numbers of rays, and count how often each half of a key has each value."""
     for k in range(len(keys)):
-        r = ray_at(which, begin + k)
+        r = np.int64(ray_at(which, begin + k))
         cell = np.uint64(0)
         for axis in range(3):
             cell |= spread_bits(cell_at(origins[r, axis], low[axis], finer)) << np.uint64(axis)

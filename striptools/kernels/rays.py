@@ -247,8 +247,8 @@ def mirror_of(octant, broad):
 
 @inlined
 def ray_at(which, place):
-    """The ray at a place, of all of them or of those that are said."""
-    return np.int64(which[place]) if len(which) > 0 else place
+    """The ray at a place, of all of them or of those that are said: uint64, so that no end is looked for."""
+    return np.uint64(which[np.uint64(place)]) if len(which) > 0 else np.uint64(place)
 
 
 @inlined
