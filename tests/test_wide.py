@@ -14,6 +14,7 @@ from striptools.hierarchies.in_strip import BinaryTree
 from striptools.hierarchies.wide import (
     BROAD,
     EMPTY,
+    EMPTY_LANE_COST,
     LEAF_BLOCK_COST,
     WIDE_NODE_COST,
     WIDTH,
@@ -46,9 +47,12 @@ def least_cost(tree, leaf_size, width):
     def children(p):
         return p + 1, p + 2 * int(tree.size[p + 1])
 
+    def as_leaf(p):
+        return area[p] * (LEAF_BLOCK_COST + EMPTY_LANE_COST * (leaf_size - tree.size[p]))
+
     @cache
     def alone(p):
-        leaf = area[p] * LEAF_BLOCK_COST if tree.size[p] <= leaf_size else np.inf
+        leaf = as_leaf(p) if tree.size[p] <= leaf_size else np.inf
         inner = area[p] * WIDE_NODE_COST + spread(p, width) if tree.size[p] > 1 else np.inf
         return min(leaf, inner)
 
@@ -62,7 +66,7 @@ def least_cost(tree, leaf_size, width):
         return alone(p) if among == 1 or tree.size[p] == 1 else min(alone(p), spread(p, among))
 
     root = WIDE_NODE_COST * area[0]
-    return root + (spread(0, width) if tree.size[0] > 1 else area[0] * LEAF_BLOCK_COST)
+    return root + (spread(0, width) if tree.size[0] > 1 else as_leaf(0))
 
 
 @given(clean_meshes(), st.integers(1, 8), st.sampled_from([WIDTH, BROAD]))
@@ -75,12 +79,14 @@ def test_collapsed_tree_is_whole(mesh, leaf_size, width):
     assert 1 <= wide.depth <= len(wide.boxes)
 
 
-def wide_cost(tree):
+def wide_cost(tree, leaf_size=WIDTH):
     """The expected cost of a ray that meets the root's box, in visits to a wide node."""
     used = tree.child != EMPTY
     boxes = np.moveaxis(tree.boxes, 1, 2)
     area = half_area(boxes.reshape(-1, 6)).reshape(used.shape)
-    cost = np.where(tree.child >= 0, WIDE_NODE_COST, LEAF_BLOCK_COST)
+    leaf = np.where(tree.child < 0, -(tree.child + 1), 0) * used
+    empty = leaf_size - tree.leaf_count[leaf]
+    cost = np.where(tree.child >= 0, WIDE_NODE_COST, LEAF_BLOCK_COST + EMPTY_LANE_COST * empty)
     lanes = boxes[0][used[0]]
     root = half_area(np.concatenate([lanes[:, :3].min(axis=0), lanes[:, 3:].max(axis=0)])[None])[0]
     share = area / root if root > 0 else np.ones_like(area)
@@ -93,7 +99,7 @@ def wide_cost(tree):
 def test_cost_is_the_least(count, leaf_size, width):
     tree, _ = random_tree(count, seed=count)
     least = least_cost(tree, leaf_size, width)
-    assert wide_cost(collapse(tree, leaf_size, width)) == pytest.approx(least, rel=1e-5)
+    assert wide_cost(collapse(tree, leaf_size, width), leaf_size) == pytest.approx(least, rel=1e-5)
 
 
 def test_lanes_say_on_which_side_of_the_centre_a_child_lies():

@@ -347,7 +347,7 @@ def build_blocks(
     leaf_boxes = np.empty((MOST_TRIANGLES, 6), np.float32)
     short = room_for_short(MOST_TRIANGLES)
     room = room_for_emission()
-    one = np.float32(1.0)
+    one, none = np.float32(1.0), np.float32(0.0)
     price = np.float32(node_price)
     roots = end - begin
     free = roots
@@ -384,7 +384,7 @@ def build_blocks(
                 leaf_boxes[place, k] = rows.boxes[tree.order[place], k]
         size = tree.size[: 2 * count - 1]
         node_boxes = boxes_from_below(size, leaf_boxes[:count])
-        split, _, _ = cheapest_forests(node_boxes, size, WIDTH, 1, one, one, price)
+        split, _, _ = cheapest_forests(node_boxes, size, WIDTH, 1, one, one, none, price)
 
         # Write the nodes, then the runs in the order that the nodes give them.
         tag = np.int64(block)
@@ -417,8 +417,8 @@ def build_top(boxes, size, items, low, per_unit, words, records, order):
     Returns:
         How many nodes there are.
     """
-    one = np.float32(1.0)
-    split, _, _ = cheapest_forests(boxes, size, WIDTH, 1, one, one, np.float32(0.0))
+    one, none = np.float32(1.0), np.float32(0.0)
+    split, _, _ = cheapest_forests(boxes, size, WIDTH, 1, one, one, none, none)
     stack = np.empty((len(items) + WIDTH, 3), np.int64)
     count = emit_nodes(
         boxes, size, split, items, low, per_unit, words, records, np.int64(0), np.int64(1), np.int64(0),

@@ -18,7 +18,7 @@ EMPTY = np.int32(-(2**31))
 
 
 @kernel
-def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_price):
+def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, lane_cost, node_price):
     """For each binary node, the cheapest way to stand for it with at most 1 to `width` wide children.
 
     Args:
@@ -27,7 +27,8 @@ def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_p
         width: Children of a node, `WIDTH` or `BROAD`.
         leaf_size: The most triangles of a leaf.
         node_cost: The cost of visiting a wide node.
-        leaf_cost: The cost of testing a leaf, full or not.
+        leaf_cost: The cost of testing a full leaf.
+        lane_cost: What a leaf costs more for each triangle that it might have held besides.
         node_price: What a wide node costs beside its visits, in visits of the root: a saving below it is not
             worth another node.
 
@@ -48,10 +49,11 @@ def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_p
         area = np.float32(area_of(boxes, p) * unit)
 
         # Let a single triangle be a leaf however many children are on offer.
+        leaf = area * (leaf_cost + lane_cost * np.float32(leaf_size - size[p]))
         if size[p] == 1:
             as_leaf[p] = True
             for j in range(1, width):
-                cost[p, j] = area * leaf_cost
+                cost[p, j] = leaf
             continue
 
         # Find the cheapest way to give all children to the two subtrees.
@@ -66,7 +68,6 @@ def cheapest_forests(boxes, size, width, leaf_size, node_cost, leaf_cost, node_p
 
         # Choose between a wide node and, where the triangles are few enough, a leaf.
         inner = best + area * node_cost + node_price
-        leaf = area * leaf_cost
         if size[p] <= leaf_size and leaf <= inner:
             as_leaf[p] = True
             cost[p, 1] = leaf
