@@ -15,10 +15,11 @@ from rays import rays_at
 from scenes import scene_of, small_scene
 
 from striptools.hierarchies.options import HierarchyOptions
+from striptools.hierarchies.rebuilt import rebuild
 from striptools.mesh.mesh import Mesh
 from striptools.threads import in_chunks
 from striptools.trace import SlowTracingWarning, Tracer, functional, launch
-from striptools.trace.leaves import lay_out_rebuilt
+from striptools.trace.leaves import lay_out_wide
 from striptools.trace.pallas import tiles
 from striptools.trace.pallas import walk as kernel
 from striptools.trace.pallas.arithmetic import BY_INTERPRETER
@@ -113,7 +114,9 @@ def tree_as_deep_as_can_be():
 
 def test_a_deep_stack_is_kept():
     scene = tree_as_deep_as_can_be()
-    tracer = Tracer.of_layout(lay_out_rebuilt(scene), device="cpu", threads=1)
+    # A triangle a leaf: with more of them in one the tree is not as deep.
+    layout = lay_out_wide(scene, *rebuild(scene.triangle_boxes(), leaf_size=1))
+    tracer = Tracer.of_layout(layout, device="cpu", threads=1)
     # From beyond the last, past it: every node's other children wait on the stack until the first was seen.
     origins = np.zeros((COUNT, 3), np.float32)
     directions = np.tile(np.array([[1, 0, 0]], np.float32), (COUNT, 1))
