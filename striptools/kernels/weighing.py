@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from striptools.kernels.compiled import fetch, inlined, kernel, maker
-from striptools.kernels.wide import WIDTH, flushed
+from striptools.kernels.wide import flushed
 
 CHUNK = 64
 """Hits that are weighed together."""
@@ -97,30 +97,31 @@ def weigh_held(room, held, scale, ray_of, turn_of, u, v):
 
 
 @inlined
-def find_slots(place, names, begin, end, slots, numbers, size):
+def find_slots(place, names, begin, end, slots, numbers, shape):
     """Find where the triangles hit lie, and have their lines fetched: two rows of a block are one."""
     for k in range(begin, end):
         i = np.uint64(k)
         slot = place[np.uint64(names[i])]
         slots[i] = slot
-        first = (slot >> 5) * size
+        first = (slot >> 5) * shape[0] * shape[1]
         for row in range(0, 10, 2):
-            fetch(numbers, first + row * WIDTH)
+            fetch(numbers, first + row * shape[1])
 
 
 @inlined
-def gather_from_blocks(origins, directions, numbers, size, rays, slots, begin, end, room, turn_of):
+def gather_from_blocks(origins, directions, numbers, shape, rays, slots, begin, end, room, turn_of):
     """Gather rays and corners of hits."""
+    size, across = np.uint64(shape[0] * shape[1]), np.uint64(shape[1])
     for k in range(begin, end):
         i = np.uint64(k - begin)
         axes = take_ray(origins, directions, rays[np.uint64(k)], room, i)
         slot = np.uint64(slots[np.uint64(k)])
-        first = (slot >> np.uint64(5)) * np.uint64(size) + (slot >> np.uint64(2) & np.uint64(7))
+        first = (slot >> np.uint64(5)) * size + (slot >> np.uint64(2) & np.uint64(7))
         for axis in range(3):
-            row = first + axes[axis] * np.uint64(3 * WIDTH)
+            row = first + axes[axis] * np.uint64(3) * across
             for j in range(3):
                 place = np.uint64(CORNERS + (3 * axis + j) * CHUNK) + i
-                room[place] = numbers[row + np.uint64(j * WIDTH)]
+                room[place] = numbers[row + np.uint64(j) * across]
         turn_of[i] = slot & np.uint64(3)
 
 
@@ -154,7 +155,7 @@ def weigh_hits(
         found_t: (k,) float32, t of each.
         found_face: (k,) int32, the reported face; negative on a miss.
         place: (f,) int32, see `fill_leaf_blocks`.
-        blocks: (l, 10, 8) float32, see `fill_leaf_blocks`; the last row is not read and may be missing.
+        blocks: (l, 10, 8) float32, see `fill_leaf_blocks`; or without the last row, or of one lane.
         scale: float32, what positions in `blocks` were multiplied by.
         triangle_of: (f,) int32, the triangle in file order of each face; (0,) where faces are triangles.
         t: (r,) float32, written.
@@ -174,13 +175,13 @@ def weigh_hits(
     room = np.zeros(ROOM, np.float32)
     turn_of = np.zeros(CHUNK, np.int32)
     slots = np.empty(len(rays), np.int32)
-    numbers, size = blocks.reshape(blocks.size), blocks.shape[1] * WIDTH
+    numbers, shape = blocks.reshape(blocks.size), blocks.shape[1:]
     for begin in range(-CHUNK, len(rays), CHUNK):
         # The lines that the next chunk needs are fetched while this one is weighed.
         end = min(begin + CHUNK, len(rays))
-        find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, numbers, size)
+        find_slots(place, names, end, min(end + CHUNK, len(rays)), slots, numbers, shape)
         if begin >= 0:
-            gather_from_blocks(origins, directions, numbers, size, rays, slots, begin, end, room, turn_of)
+            gather_from_blocks(origins, directions, numbers, shape, rays, slots, begin, end, room, turn_of)
             weigh_held(room, end - begin, scale, rays[begin:end], turn_of, u, v)
 
 
