@@ -415,10 +415,10 @@ def test_a_scene_without_instances_says_nothing_of_them():
 def test_many_instances_take_little_more_than_their_geometry():
     random = np.random.default_rng(0)
     matrices = random_matrices(random, 300, 6.0)
-    scene = convert(mesh_of([sphere(40, 60)], np.zeros(300), matrices))
+    scene = convert(mesh_of([sphere(48, 72)], np.zeros(300), matrices))
     shared = Tracer(scene, device="cpu", instances="shared")
     flat = Tracer(scene, device="cpu", instances="flattened")
-    assert shared.resident_bytes * 90 < flat.resident_bytes
+    assert shared.resident_bytes * 100 < flat.resident_bytes
     different, hits = agree(scene, shared, flat, rays_through(scene, 5000))
     assert hits > 500
     assert different <= hits // 1000

@@ -5,7 +5,7 @@ import numpy as np
 from striptools.kernels.bits import bits_set, highest_bit
 from striptools.kernels.blocks import axis_of, block_bits, block_counts, take
 from striptools.kernels.compiled import fetch, helper, inlined, kernel
-from striptools.kernels.weighing import CHUNK, CORNERS, ROOM, note_hits, take_ray, weigh_held
+from striptools.kernels.weighing import CHUNK, ROOM, note_hits, take_corners, take_ray, weigh_held
 from striptools.kernels.wide import EMPTY, LEAST_NORMAL, WIDTH, precedes
 
 SLOT_IS_LEAF = 1 << 31
@@ -399,11 +399,7 @@ def weigh_packed_hits(
             half, column = slot // CHUNK & 1, slot % CHUNK
             axes = take_ray(origins, directions, r, room, i)
             first = np.uint64(half * 9 * CHUNK + column)
-            for axis in range(3):
-                row = first + axes[axis] * np.uint64(3 * CHUNK)
-                for j in range(3):
-                    place = np.uint64(CORNERS + (3 * axis + j) * CHUNK + i)
-                    room[place] = flat[row + np.uint64(j * CHUNK)]
+            take_corners(flat, first, np.uint64(CHUNK), axes, room, np.uint64(i))
             # Name its corners as the reported face does.
             rotation = rotations[triangle[r]] if len(rotations) > 0 else 0
             turn_of[i] = (turns[half, column] + rotation) % 3

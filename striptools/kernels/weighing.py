@@ -109,6 +109,15 @@ def find_slots(place, names, begin, end, slots, numbers, shape):
 
 
 @inlined
+def take_corners(numbers, first, across, axes, room, i):
+    """Gather corners as place i along these axes: from `first` on, in nine rows that are `across` apart."""
+    for axis in range(3):
+        row = first + axes[axis] * np.uint64(3) * across
+        for j in range(3):
+            room[np.uint64(CORNERS + (3 * axis + j) * CHUNK) + i] = numbers[row + np.uint64(j) * across]
+
+
+@inlined
 def gather_from_blocks(origins, directions, numbers, shape, rays, slots, begin, end, room, turn_of):
     """Gather rays and corners of hits."""
     size, across = np.uint64(shape[0] * shape[1]), np.uint64(shape[1])
@@ -117,11 +126,7 @@ def gather_from_blocks(origins, directions, numbers, shape, rays, slots, begin, 
         axes = take_ray(origins, directions, rays[np.uint64(k)], room, i)
         slot = np.uint64(slots[np.uint64(k)])
         first = (slot >> np.uint64(5)) * size + (slot >> np.uint64(2) & np.uint64(7))
-        for axis in range(3):
-            row = first + axes[axis] * np.uint64(3) * across
-            for j in range(3):
-                place = np.uint64(CORNERS + (3 * axis + j) * CHUNK) + i
-                room[place] = numbers[row + np.uint64(j) * across]
+        take_corners(numbers, first, across, axes, room, i)
         turn_of[i] = slot & np.uint64(3)
 
 

@@ -9,7 +9,6 @@ on this side makes one of them late: two cores were busy 1.6 to 1.7 times as muc
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from itertools import pairwise
 from threading import Event
 from typing import Any, NamedTuple
@@ -176,10 +175,13 @@ class _Runs:
             begin = end
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        # Several threads may be here: who finds nothing left is done.
-        with suppress(IndexError):
-            while True:
-                yield self._rays(*self._waiting.popleft())
+        while True:
+            # Another thread may take the last at any time: who finds nothing left is done.
+            try:
+                run = self._waiting.popleft()
+            except IndexError:
+                return
+            yield self._rays(*run)
 
     def _rays(self, begin: int, end: int) -> np.ndarray:
         if end - begin == self._count:
